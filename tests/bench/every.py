@@ -78,7 +78,6 @@ BENCHES = {
     "uav_any_view": Bench(
         "any target in oblique views",
         ("--kinds", "rendered,rendered away", "--models", "ground"),
-        ("--models", "ground"),
         data=True,
     ),
     "uav_aerial": Bench("one car from a drone, real video", ("--models", "ground"), data=True),

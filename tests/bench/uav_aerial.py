@@ -183,6 +183,7 @@ def main() -> None:
         return
     cv2.setNumThreads(1)
     wanted = [name for name in arguments.models.split(",") if name]
+    uav_rivals.restart_with_contrib("tests.bench.uav_aerial", wanted)
     absent = [name for name in wanted if name in uav_rivals.NAMES and not uav_rivals.available(name)]
     video = read_video(folder / VIDEO)
     results = [

@@ -36,8 +36,9 @@ class Score:
     """Counts of one sequence and one tracker.
 
     near, frames: frames in view (at least half) within max(20 px, half a box), of all. overlap: mean intersection over
-    union in view. away_near, claimed, away: frames without any part of the target: within two box lengths, reported
-    visible, all. held: visible and near in all of the last 20 frames. ms: CPU per frame.
+    union in view; success: area under the success plot, the share of these frames above each of 21 overlaps from 0 to
+    1. away_near, claimed, away: frames without any part of the target: within two box lengths, reported visible, all.
+    held: visible and near in all of the last 20 frames. ms: CPU per frame.
     """
 
     kind: str
@@ -46,6 +47,7 @@ class Score:
     near: int
     frames: int
     overlap: float
+    success: float
     away_near: int
     claimed: int
     away: int
@@ -72,6 +74,7 @@ def score(sequence: Sequence, estimates: list[Estimate], model: str, ms: float) 
         int((near & seen).sum()),
         int(seen.sum()),
         float(overlap[seen].mean()),
+        float((overlap[seen][:, None] > np.linspace(0.0, 1.0, 21)).mean()),
         int((away & (error < 2.0 * length)).sum()),
         int((away & visible).sum()),
         int(away.sum()),
@@ -146,7 +149,7 @@ def real(data: Path, windows: bool = True) -> Iterator[Sequence]:
 
 def table(scores: list[Score]) -> str:
     """One line for each kind and model."""
-    titles = ("in view", "overlap", "away", "claimed", "held", "ms/frame")
+    titles = ("in view", "overlap", "success", "away", "claimed", "held", "ms/frame")
     lines = [f"{'kind':16s}{'model':8s}" + "".join(f"{title:>9s}" for title in titles)]
     for kind, model in dict.fromkeys((s.kind, s.model) for s in scores):
         part = [s for s in scores if (s.kind, s.model) == (kind, model)]
@@ -155,7 +158,8 @@ def table(scores: list[Score]) -> str:
         claimed = f"{100 * sum(s.claimed for s in part) / away:7.1f} %" if away else "-"
         lines.append(
             f"{kind:16s}{model:8s}{100 * sum(s.near for s in part) / sum(s.frames for s in part):7.1f} %"
-            f"{np.mean([s.overlap for s in part]):9.2f}{share:>9s}{claimed:>9s}"
+            f"{np.mean([s.overlap for s in part]):9.2f}{np.mean([s.success for s in part]):9.2f}"
+            f"{share:>9s}{claimed:>9s}"
             f"{f'{sum(s.held for s in part)}/{len(part)}':>9s}{np.mean([s.ms for s in part]):9.1f}"
         )
     return "\n".join(lines)
@@ -172,6 +176,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     cv2.setNumThreads(1)
+    uav_rivals.restart_with_contrib("tests.bench.uav_any_view", options.models.split(","))
     models = [m for m in options.models.split(",") if m not in uav_rivals.NAMES or uav_rivals.available(m)]
     left_out = [m for m in options.models.split(",") if m not in models]
     kinds = [kind for kind in options.kinds.split(",") if kind]

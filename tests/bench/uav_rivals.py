@@ -1,20 +1,21 @@
 """OpenCV's CSRT, KCF and MOSSE behind the tracker interface. They need opencv-contrib, which only the benches use.
 
-opencv-contrib-python-headless and opencv-python-headless are both ``cv2`` and can't share an environment. Put the
-former, of the same version as the latter, into a folder of its own and that folder first on the path:
-
-    python -m pip install --no-deps --target contrib opencv-contrib-python-headless==5.0.0.93
-    PYTHONPATH=contrib python -m tests.bench.uav_tracker
+opencv-contrib-python-headless and opencv-python-headless are both ``cv2`` and can't share an environment: ``python -m
+tests.bench.peers`` puts the former into a folder of its own, which has to be first on the path.
 """
 
 from __future__ import annotations
 
 import math
+import os
+import sys
+from collections.abc import Iterable
 from typing import Any
 
 import cv2
 
 from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
+from tests.bench.peers import CONTRIB
 
 NAMES = ("csrt", "kcf", "mosse")
 
@@ -27,6 +28,14 @@ def available(name: str) -> bool:
 def _maker(name: str) -> Any:
     title = f"Tracker{name.upper()}_create"
     return getattr(cv2, title, None) or getattr(getattr(cv2, "legacy", None), title, None)
+
+
+def restart_with_contrib(module: str, names: Iterable[str]) -> None:
+    """Start ``module`` again with opencv-contrib first on the path, if it is there, wanted and not used yet."""
+    wanted = any(name in NAMES and not available(name) for name in names)
+    if wanted and CONTRIB.is_dir() and str(CONTRIB) not in sys.path:
+        path = os.pathsep.join([str(CONTRIB), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]).rstrip(os.pathsep)
+        os.execve(sys.executable, [sys.executable, "-m", module, *sys.argv[1:]], {**os.environ, "PYTHONPATH": path})
 
 
 class OpenCvTracker:

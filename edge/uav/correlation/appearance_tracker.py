@@ -7,41 +7,28 @@ the region in which it can be is searched. No lens and no telemetry are used.
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 
 from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
-from edge.uav.correlation.candidate import Candidate
-from edge.uav.correlation.filter import CorrelationFilter
+from edge.uav.correlation.belief import Belief
+from edge.uav.correlation.candidate import Kinematics
+from edge.uav.correlation.filter import CorrelationFilter, Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.correlation.redetection import Prediction, Redetection
 from edge.uav.correlation.scale import BoxFlow, ScaleFilter
-from edge.uav.correlation.search import Found, search, tile
+from edge.uav.correlation.search import search, tile
 from edge.uav.correlation.shape import Outline
+from edge.uav.correlation.velocity import VelocityFilter
 from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
 from edge.uav.target.box import check_target_box
 from protocols.geometry.types import Floats
 
 _LEARN_INSIDE = 0.97  # share of the box in the image above which appearance, size and velocity are learnt
 _MEASURE_INSIDE = 0.6  # below it nothing is measured
-_GRACE_FRAMES = 3  # frames with clear evidence against the target before it is searched for
-_REJECT = -3.0  # log likelihood ratio of clear evidence against the target
-_MARGIN = 1.0  # log odds by which a re-detection must exceed the next best place
-_ANYWHERE = 0.03  # prior probability that the target is not near its prediction
-_PROBATION = 10  # frames after a re-detection in which any evidence against the target ends it
-_PROPOSED = -1.0  # log prior of a place that another tracker has found
-_OBSERVE_EVERY = 6  # frames between two looks at the background
+_OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
-_DETECTION = 0.25  # probability that one search finds a target in view
-_CHANGE = 0.1  # std of the similarity of a target that has been away
-_PEAK_SHARE = 0.55  # of the usual height of the filter's answer, at a re-detection
-_PEAK_TARGET, _PEAK_BACKGROUND = (0.9, 0.2), (0.3, 0.15)  # mean and std of that share, on and off the target
-_PEAK_LIMIT = 3.0  # of the log likelihood ratio of that share
-_VELOCITY_S = 0.5  # over which velocity is averaged
-_ACCELERATION = 0.7  # std, in target lengths a second squared
 _MOVES = 0.3  # speed over the scene at which a heading is given, in target lengths a second
-_DRIFT = 0.05  # std of the predicted place, in target lengths a second
 _LOST_STD, _LOST_AFTER_S = 8.0, 15.0  # in target lengths; as of the ground tracker
 _MAX_GROWTH = 8.0  # of a side since the first frame
 _SCALE_GAIN = 0.5  # of the scale filter's correction, per frame
@@ -49,12 +36,9 @@ _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or 
 _ANCHOR_STEP = 0.3  # share of the way to it
 _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
 _TRIAL_SIZES = (0.9, 1.1)
-_FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
 _LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
 _KEEP_EVERY = 5  # frames between two keyframes
 _RELOCATE_EVERY = 4  # frames between two attempts to recognise the scene
-_SIZES = (1.0, 0.87, 1.15)
-_ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1, 0.0, 1.57)
 
 
 class AppearanceTracker:
@@ -72,9 +56,8 @@ class AppearanceTracker:
         self._time, self._frame = time, 0
         self.box = OrientedBox.upright(target)
         self._first = self.box.sides
-        self._velocity = np.zeros(2)  # over the scene, in image pixels a second
+        self._motion_filter = VelocityFilter(self.length)
         self._turn_rate = 0.0
-        self._steps: deque[Floats] = deque(maxlen=int(np.clip(_VELOCITY_S * self._fps, 4, 20)))
         self._filter = CorrelationFilter(target.width, target.height)
         self._scale, self._flow, self._memory = ScaleFilter(), BoxFlow(), TemplateMemory()
         self._scene.update(image, None)
@@ -90,14 +73,14 @@ class AppearanceTracker:
         self._missed = 0
         self._unseen_s = 0.0
         self._scene.keep()
-        self._last_sight, self._since_keyframe = (self.box, self._velocity), np.eye(3)
-        self._near = 1.0 - _ANYWHERE
+        self._last_sight, self._since_keyframe = (self.box, np.zeros(2)), np.eye(3)
+        self._redetection = Redetection(self._size, self._memory, self._respond)
         self._ratio = 0.0
         self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
         self._expected: tuple[OrientedBox, bool] | None = None
         self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
-        self._confirmed = _PROBATION  # frames since the target was found again
-        self._candidate: Candidate | None = None
+        self._belief = Belief()
+        self._searching = False
         return self._estimate(time)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
@@ -110,14 +93,13 @@ class AppearanceTracker:
         self._frame += 1
         if image is None or image.shape[:2] != (self._size[1], self._size[0]):
             # Nothing speaks against the target: it is looked for where it was going, but needs evidence for it.
-            most, self._confirmed = max(self._missed, _GRACE_FRAMES), 0
+            self._belief.add(0.0, dt)
             self._miss(dt)
-            self._missed = min(self._missed, most)
             return self._estimate(time)
         self.motion = self._scene.update(image, self._outline() if self._missed == 0 else None)
         origin = self._predict(dt)
         self.debug = {}
-        if self._missed <= _GRACE_FRAMES:
+        if not self._searching:
             self._track(image, origin, dt)
         else:
             self._look_for(image, dt)
@@ -131,10 +113,7 @@ class AppearanceTracker:
     @property
     def std(self) -> float:
         """Of the target's centre, one coordinate [px]."""
-        t = self._unseen_s
-        if self._missed == 0:
-            return 0.5 + 0.02 * self.length
-        return float(0.5 + self.length * (0.05 + _DRIFT * t + 0.5 * _ACCELERATION * t * t))
+        return 0.5 + (0.02 * self.length if self._missed == 0 else self._motion_filter.std)
 
     @property
     def sees(self) -> bool:
@@ -164,30 +143,27 @@ class AppearanceTracker:
             if self._missed == 0:
                 self._since_keyframe = _square(motion.matrix) @ self._since_keyframe
             origin = motion.at(box.centre, self._scene.reach)
-            self._velocity = linear @ self._velocity
-            self._steps = deque((linear @ step for step in self._steps), maxlen=self._steps.maxlen)
+            self._motion_filter.follow_scene(linear)
             turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
             if self._missed == 0:
                 box = box.sized(box.sides * motion.zoom).turned(turn)
-            if self._candidate is not None:
-                self._candidate.move(motion, self._scene.reach, dt)
+            self._redetection.move(motion, self._scene.reach, dt)
         if self._missed:
             self._broken |= not motion.trusted
             angle = self._turn_rate * dt
-            c, s = np.cos(angle), np.sin(angle)
-            self._velocity = np.array([[c, -s], [s, c]]) @ self._velocity
+            self._motion_filter.turn(angle)
             self._turn_rate *= float(np.exp(-dt / 0.7))
             box = box.turned(angle)
             # A similarity to the whole scene is coarser than the chain with its parallax, as long as that holds.
-            if self._broken and self._missed > _GRACE_FRAMES and self._missed % _RELOCATE_EVERY == 0:
+            if self._broken and self._searching and self._missed % _RELOCATE_EVERY == 0:
                 relocated = self._relocated()
                 if relocated is not None:
                     box, origin, self._broken = relocated, relocated.centre, False
-        self.box = box.at(origin + self._velocity * dt)
+        self.box = box.at(origin + self._motion_filter.predict(dt, self.length))
         if self._expected is not None:
             (expected, found), self._expected = self._expected, None
-            if found and self._candidate is None and self._missed % 2:
-                self._candidate = Candidate(expected, _PROPOSED)
+            if found and self._searching:
+                self._redetection.propose(expected, self._prediction())
             elif not found:
                 self.box = box.at(expected.centre)
         return origin
@@ -201,8 +177,8 @@ class AppearanceTracker:
         # From the image of the last sight to the keyframe, and on to this image.
         matrix = (_square(matrix) @ np.linalg.inv(self._since_keyframe))[:2]
         linear = matrix[:, :2]
-        self._velocity = linear @ velocity
-        moved = seen.at(linear @ seen.centre + matrix[:, 2] + self._velocity * self._unseen_s)
+        self._motion_filter.velocity = linear @ velocity
+        moved = seen.at(linear @ seen.centre + matrix[:, 2] + self._motion_filter.velocity * self._unseen_s)
         zoom = float(np.sqrt(abs(np.linalg.det(linear))))
         turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
         return moved.sized(seen.sides * zoom).turned(turn)
@@ -210,36 +186,28 @@ class AppearanceTracker:
     def _track(self, image: Image, origin: Floats, dt: float) -> None:
         """Measure the target about its prediction."""
         if self.box.share_inside(self._size) < _MEASURE_INSIDE:
-            self._missed = max(self._missed, _GRACE_FRAMES)  # it leaves the image: no grace
+            self._searching = True  # it leaves the image
             self._miss(dt)
             return
-        box, peak = self._respond(image, self.box)
-        score = self._memory.score(image, box)
-        ratio = self._ratio = self._memory.log_ratio(score) + self._peak_ratio(peak)
-        self.debug = {"peak": peak, "score": score, "llr": ratio}
-        self._confirmed += 1
-        if self._confirmed <= _PROBATION and ratio < 0.0:
-            self._missed = _GRACE_FRAMES  # it was taken for the target by mistake: no grace
-        elif ratio >= _REJECT:
-            self._accept(image, box, score, peak, origin, dt)
-            return
-        self._miss(dt)
+        box, answer = self._respond(image, self.box)
+        score, peak = self._memory.score(image, box), answer.peak
+        ratio = self._ratio = self._memory.tracking_ratio(score) + answer.log_ratio
+        self._belief.add(ratio, dt)
+        self.debug = {"peak": peak, "ratio": answer.ratio, "score": score, "llr": ratio, "b": self._belief.log_odds}
+        if self._belief.visible:
+            self._accept(image, box, score, peak, dt)
+        else:
+            self._searching = self._belief.gone
+            self._miss(dt)
+        if self._frame % (_OBSERVE_EVERY if self.certain else _OBSERVE_DOUBTFUL_EVERY) == 0:
+            self._observe_background(image, box)
 
-    def _peak_ratio(self, peak: float) -> float:
-        """log likelihood ratio of the filter's answer: target against background, bounded."""
-        share = peak / self._peak
-        target = -0.5 * (min(share - _PEAK_TARGET[0], 0.0) / _PEAK_TARGET[1]) ** 2 - np.log(_PEAK_TARGET[1])
-        background = -0.5 * (max(share - _PEAK_BACKGROUND[0], 0.0) / _PEAK_BACKGROUND[1]) ** 2
-        return float(np.clip(target - background + np.log(_PEAK_BACKGROUND[1]), -_PEAK_LIMIT, _PEAK_LIMIT))
-
-    def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, origin: Floats, dt: float) -> None:
-        self._missed, self._unseen_s, self._near = 0, 0.0, 1.0 - _ANYWHERE
+    def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, dt: float) -> None:
+        self._missed, self._unseen_s = 0, 0.0
         self._broken = False
-        self._peak += max(0.1, 1.0 / (self._frame + 1.0)) * (peak - self._peak)
-        if box.share_inside(self._size) > _LEARN_INSIDE:
-            step = (box.centre - origin) / dt
-            self._steps.append(step)
-            self._velocity = np.median(np.array(self._steps), axis=0) * min(1.0, len(self._steps) / 4)
+        inside = box.share_inside(self._size)
+        self._motion_filter.correct(box.centre - self.box.centre, self.length, 1.0 - inside)
+        if inside > _LEARN_INSIDE:
             wider, higher, turn = self._flow.change(image, box.centre)
             box = box.sized(box.sides * [wider, higher]).turned(turn)
             self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)
@@ -251,33 +219,33 @@ class AppearanceTracker:
             factor = self._scale.factor(image, box) ** _SCALE_GAIN if self._frame % 2 else 1.0
             sides = np.clip(box.sides * factor, self._first / _MAX_GROWTH, self._first * _MAX_GROWTH)
             box = box.sized(np.clip(sides, 4.0, 0.9 * np.array(self._size)))
-            if self._ratio > _LEARN_ABOVE:
+            if self._ratio > _LEARN_ABOVE and self._belief.log_odds > _CERTAIN:
                 self._learn(image, box, score, peak)
             if self._frame % _KEEP_EVERY == 0:
                 self._scene.keep()
                 self._since_keyframe = np.eye(3)
-            self._last_sight = box, self._velocity.copy()
+            self._last_sight = box, self._motion_filter.velocity
         self.box = box
         self._flow.remember(image, box)
 
-    def _respond(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, float]:
-        """The box at the peak of the filter's answer, and the peak; a second look where the first was off centre."""
+    def _respond(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, Response]:
+        """The box at the peak of the filter's answer; a second look where the first was off centre."""
         answer = self._filter.respond(image, box)
         moved = box.at(box.centre + [answer.x, answer.y])
         if np.hypot(answer.x, answer.y) > 0.35 * np.sqrt(box.width * box.height):
             again = self._filter.respond(image, moved)
             if again.peak > answer.peak:
-                return moved.at(moved.centre + [again.x, again.y]), again.peak
-        return moved, answer.peak
+                return moved.at(moved.centre + [again.x, again.y]), again
+        return moved, answer
 
     def _learn(self, image: Image, box: OrientedBox, score: float, peak: float) -> None:
-        self._filter.learn(image, box)
+        self._filter.learn(image, box, self._memory.agrees(self._memory.first_score(image, box)))
         if self._frame % 2 == 0:
             self._scale.learn(image, box)
         self._memory.confirm(score)
+        self._peak += max(0.1, 1.0 / (self._frame + 1.0)) * (peak - self._peak)
         if self._frame % _OBSERVE_EVERY == 0:
             self._memory.add(image, box)
-            self._observe_background(image, box)
 
     def _anchored(self, image: Image, box: OrientedBox) -> OrientedBox:
         """The box, drawn towards the size, shape and angle at which it looks most like the first one.
@@ -304,78 +272,31 @@ class AppearanceTracker:
             found = search(image, self._memory, where, reach, 8)
             away = [f.score for f in found if np.abs(box.axes.T @ (f.box.centre - box.centre) / box.sides).max() > 0.7]
             self._memory.observe_background(np.array(away), float(np.prod(1.0 + 2.0 * reach / box.sides)))
+            if where is box and away:
+                self._memory.observe_rival(max(away))
 
     def _miss(self, dt: float) -> None:
+        if self._missed == 0:
+            self._redetection = Redetection(self._size, self._memory, self._respond)
         self._missed += 1
         self._unseen_s += dt
-        self._candidate = None
 
     def _look_for(self, image: Image, dt: float) -> None:
         """Search for the target where it can be."""
         self._missed += 1
         self._unseen_s += dt
-        if self._candidate is not None:
-            self._test(image, dt)
-            return
-        k = self._missed - _GRACE_FRAMES
-        box = self.box.sized(self.box.sides * _SIZES[k // 2 % len(_SIZES)]).turned(_ANGLES[k // 2 % len(_ANGLES)])
-        reach = 2.5 * self.std + 0.3 * box.sides
-        if k % 2:
-            box, reach = tile(box, self._size, k // 2)
-        found = search(image, self._memory, box, reach)
-        if found:
-            self._consider(image, found, dt)
-        if k % 2 == 0:
-            # Where it was expected and is not seen, it is less and less likely to be.
-            self._near *= 1.0 - _DETECTION * self.box.share_within(reach, self._size)
+        found = self._redetection.look(image, self._prediction(), dt)
+        self.debug = self._redetection.debug
+        if found is not None:
+            self._missed, self._unseen_s, self._searching = 0, 0.0, False
+            self.box = found.box
+            self._motion_filter.restart(*found.velocity(), self.length)
+            self._belief = Belief(found.log_odds)
+            self._flow.remember(image, self.box)
 
-    def _log_prior(self, place: Floats) -> float:
-        """Log probability that the target is in the box about ``place`` (2,): near the prediction, or anywhere."""
-        area = float(self.box.width * self.box.height)
-        std = self.std
-        squared = float(np.square(place - self.box.centre).sum()) / std**2
-        share = self._near / (self._near + _ANYWHERE)
-        near = np.log(share + 1e-12) - 0.5 * squared + np.log(min(area / (2.0 * np.pi * std * std), 1.0))
-        return float(np.logaddexp(near, np.log((1.0 - share) * area / (self._size[0] * self._size[1]))))
-
-    def _consider(self, image: Image, found: list[Found], dt: float) -> None:
-        """Take up the likeliest of the places found, if it is likelier by far than any other."""
-        odds = [self._memory.log_ratio(f.score, _CHANGE) + self._log_prior(f.box.centre) for f in found]
-        order = np.argsort(odds)[::-1]
-        best = int(order[0])
-        self.debug = {"score": found[best].score, "odds": odds[best], "near": self._near}
-        if len(odds) > 1 and odds[best] - odds[int(order[1])] < _MARGIN:
-            return
-        self._candidate = Candidate(found[best].box, self._log_prior(found[best].box.centre))
-        self._test(image, dt)
-
-    def _test(self, image: Image, dt: float) -> None:
-        """Add a frame's evidence to the candidate's odds; take it for the target, or drop it."""
-        candidate = self._candidate
-        assert candidate is not None
-        box, peak = self._respond(image, candidate.box)
-        if candidate.hits == 0:
-            # Before another size or angle is believed: the last one, localised about the same place.
-            same, same_peak = self._respond(image, self.box.at(candidate.box.centre))
-            if self._memory.score(image, same) > self._memory.score(image, box):
-                box, peak = same, same_peak
-        trials = [box, *(box.sized(f * box.sides) for f in (_TRIAL_SIZES if candidate.hits else _FIRST_SIZES))]
-        scores = [self._memory.score(image, trial) for trial in trials]
-        score, box = max(scores), trials[int(np.argmax(scores))]
-        evidence = self._memory.log_ratio(score, _CHANGE)
-        self.debug |= {"score": score, "llr": evidence, "peak": peak, "usual": self._peak, "prior": candidate.prior}
-        candidate.add(box, evidence, dt)
-        weak = evidence < 0.0 or peak < _PEAK_SHARE * self._peak or box.share_inside(self._size) < _MEASURE_INSIDE
-        if weak or candidate.hopeless:
-            self._candidate = None
-        elif candidate.accepted:
-            self._candidate = None
-            self._steps = deque(candidate.steps, maxlen=self._steps.maxlen)
-            if candidate.steps:
-                self._velocity = np.median(candidate.steps, axis=0)
-            self._missed, self._unseen_s, self._confirmed = 0, 0.0, 0
-            self.box = box
-            self._flow.remember(image, box)
+    def _prediction(self) -> Prediction:
+        motion = Kinematics(self._motion_filter.velocity, self._motion_filter.velocity_std, self.length)
+        return Prediction(self.box, self.std, motion, self._missed, self._unseen_s)
 
     def _outline(self) -> Floats:
         """x0, y0, x1, y1 about the target [px]."""
@@ -389,8 +310,9 @@ class AppearanceTracker:
         centre, extent = self._shape.bounds(self.box)
         x, y = (np.nan, np.nan) if state is TrackState.LOST else (float(centre[0]), float(centre[1]))
         # Below it, the direction of the velocity is noise.
-        moves = state is not TrackState.LOST and np.hypot(*self._velocity) > _MOVES * self.length
-        heading = float(np.arctan2(self._velocity[1], self._velocity[0])) if moves else np.nan
+        velocity = self._motion_filter.velocity
+        moves = state is not TrackState.LOST and np.hypot(*velocity) > _MOVES * self.length
+        heading = float(np.arctan2(velocity[1], velocity[0])) if moves else np.nan
         return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), heading, self.std)
 
 

@@ -23,6 +23,10 @@ _PADDING = 2.4  # of the window, over the mean side of the target, added on both
 _LABEL_STD = 1.0 / 16.0  # of the wanted peak, over the geometric mean of the target's sides
 _ITERATIONS, _PENALTY, _PENALTY_GROWTH, _REGULARISATION = 3, 5.0, 3.0, 0.01  # of the published method
 _LEARNING_RATE = 0.025
+_FIRST_VIEWS, _FORGETTING = 4, 0.02  # that the filter of the whole past begins with; share of a later one in it
+_ON, _OFF = (1.1, 0.4), (0.1, 0.3)  # mean and std of the log of the ratio, on the target and off it
+_CHANGED = 0.2  # share of the frames in which the target does not look as before
+_LIMIT = 3.0  # of the log likelihood ratio
 _CENTRE_STD = 0.8  # of the mask, over half a side: a box's corners show background
 
 Spectrum = npt.NDArray[np.complex64]
@@ -32,13 +36,22 @@ Spectrum = npt.NDArray[np.complex64]
 class Response:
     """Peak of the filter's answer. x, y: offset of the target from the window's centre [image px].
 
-    peak: height; 1 where the target looks as it was learnt. ratio: peak over the highest value elsewhere.
+    peak: height; 1 where the target looks as it was learnt. ratio: what the filter of the whole past answers at the
+    same place, over its highest answer elsewhere in the window.
     """
 
     x: float
     y: float
     peak: float
     ratio: float
+
+    @property
+    def log_ratio(self) -> float:
+        """log p(ratio | on the target) - log p(ratio | on the background), natural, bounded."""
+        value = np.log(max(self.ratio, 1e-3))
+        off = float(np.exp(-0.5 * (max(value - _OFF[0], 0.0) / _OFF[1]) ** 2)) / _OFF[1]
+        on = float(np.exp(-0.5 * (min(value - _ON[0], 0.0) / _ON[1]) ** 2)) / _ON[1]
+        return float(min(np.log(((1.0 - _CHANGED) * on + _CHANGED * off) / off), _LIMIT))
 
 
 class CorrelationFilter:
@@ -66,22 +79,29 @@ class CorrelationFilter:
         self._mask = (np.clip(0.5 - outside, 0.0, 1.0) * np.exp(-0.5 * squared / _CENTRE_STD**2)).astype(np.float32)
         self._exclude = max(1.5, 0.35 * float(target.min()))
         self._filter: Spectrum | None = None
+        self._past: Spectrum | None = None  # mean of all that was learnt, against drift
+        self._count = 0
         self._weights = np.full((CHANNELS, 1, 1), 1.0 / CHANNELS, np.float32)
 
-    def learn(self, image: Image, box: OrientedBox, gain: float = 1.0) -> None:
-        """Learn from the target's box; ``gain`` scales the learning rate."""
+    def learn(self, image: Image, box: OrientedBox, lasting: bool = True) -> None:
+        """Learn from the target's box; ``lasting``: also for the filter of the whole past."""
         spectrum = self._spectrum(image, box)
         new, weights = self._train(spectrum)
         if self._filter is None:
             self._filter, self._weights = new, weights
         else:
-            rate = np.float32(_LEARNING_RATE * gain)
+            rate = np.float32(_LEARNING_RATE)
             self._filter = (1 - rate) * self._filter + rate * new
             self._weights = (1 - rate) * self._weights + rate * weights
+        if lasting:
+            self._count += 1
+            share = np.float32(1.0 / self._count if self._count <= _FIRST_VIEWS else _FORGETTING)
+            self._past = new * weights if self._past is None else (1 - share) * self._past + share * new * weights
 
     def respond(self, image: Image, box: OrientedBox) -> Response:
         """The answer in a window about a box, for a target of its size and angle."""
         assert self._filter is not None
+        assert self._past is not None
         spectrum = self._spectrum(image, box)
         product = (np.conj(self._filter) * spectrum * self._weights).sum(axis=0)
         answer = np.fft.fftshift(scipy.fft.irfft2(product, s=self._cells[::-1]))
@@ -90,11 +110,13 @@ class CorrelationFilter:
         away = np.maximum(
             np.abs(self._dx[0] - self._dx[0][row, column]), np.abs(self._dx[1] - self._dx[1][row, column])
         )
-        other = float(answer[away > self._exclude].max())
+        product = (np.conj(self._past) * spectrum).sum(axis=0)
+        past = np.fft.fftshift(scipy.fft.irfft2(product, s=self._cells[::-1]))
+        near, other = float(past[away <= 1.5].max()), float(past[away > self._exclude].max())
         dx = self._dx[0][row, column] + _refined(answer[row], column)
         dy = self._dx[1][row, column] + _refined(answer[:, column], row)
         offset = box.axes @ (np.array([dx, dy]) * box.sides * self._window / np.array(self._cells))
-        return Response(float(offset[0]), float(offset[1]), peak, peak / max(other, 1e-3))
+        return Response(float(offset[0]), float(offset[1]), peak, max(near, 0.0) / max(other, 1e-3))
 
     def _spectrum(self, image: Image, box: OrientedBox) -> Spectrum:
         patch = crop(image, box.sized(box.sides * self._window), self._patch)

@@ -23,10 +23,10 @@ CELLS, CELL_PX = 6, 4
 SIDE = CELLS * CELL_PX
 _MAX_TEMPLATES = 8
 _NEW_BELOW = 0.9  # similarity to the most similar template below which a view becomes a template
-_FIRST_ABOVE = 0.5  # similarity to the first template that a new one must have, against drift
 _TAIL_BINS = 20  # of the histogram of what places beside the target score, from 0 to 1
 _LOOK_ALIKES = 0.5  # places as similar as the target that are taken to have been seen before the first image
 _PLACES = 300.0  # number of places that this start is worth
+_MIN_STD = 0.07  # of a score of the same thing, from one image to another
 _MAX_SCANNED = 4  # templates with which a region is searched
 _COLOUR_WEIGHT = np.float32(1.3)
 _CENTRED = np.float32(0.5)  # share of a channel's mean that is taken out
@@ -59,6 +59,7 @@ class TemplateMemory:
         # Before anything was seen: a target changes by about a tenth from frame to frame.
         self._target = _Normal(0.8, 0.15, 4.0, 60.0)
         self._background = _Normal(0.2, 0.2, 2.0, 200.0)
+        self._rival = _Normal(0.4, 0.1, 1.0, 6.0)
         self._tail = np.zeros(_TAIL_BINS)
         self._places = _PLACES
 
@@ -67,13 +68,17 @@ class TemplateMemory:
         new = vector(image, box)
         if self._templates:
             similarity = np.array([float(t @ new) for t in self._templates])
-            if similarity.max() > _NEW_BELOW or similarity[0] < _FIRST_ABOVE:
+            if similarity.max() > _NEW_BELOW or not self.agrees(float(similarity[0])):
                 return
         self._templates.append(new)
         self._used.append(self._count)
         if len(self._templates) > _MAX_TEMPLATES:
             oldest = 1 + int(np.argmin(self._used[1:]))
             del self._templates[oldest], self._used[oldest]
+
+    def agrees(self, first_score: float) -> bool:
+        """Whether a box is more like the first view, by its ``first_score``, than anything beside the target is."""
+        return first_score > self._rival.mean + self._rival.std
 
     def score(self, image: Image, box: OrientedBox) -> float:
         """Similarity (-1 to 1) of the box to the most similar template."""
@@ -114,10 +119,11 @@ class TemplateMemory:
         order = sorted(range(1, len(self._templates)), key=lambda k: -self._used[k])[: _MAX_SCANNED - 1]
         return [self._templates[0], *(self._templates[k] for k in order)]
 
-    def log_ratio(self, score: float, change: float = 0.0) -> float:
+    def log_ratio(self, score: float, change: float = 0.0, other: float = 0.0) -> float:
         """log p(score | target) - log p(score | background), natural.
 
-        change: std of what the score of a target that has been away may have changed.
+        change: std of what the score of a target that has been away may have changed. other: log likelihood ratio of
+        another cue; half of the look-alikes have it too.
         """
         t, b = self._target, self._background
         std = float(np.hypot(t.std, change))
@@ -126,12 +132,26 @@ class TemplateMemory:
         # Something that looks like the target may stand anywhere, however unlike it the rest of the background is.
         k = min(int(max(score, 0.0) * _TAIL_BINS), _TAIL_BINS - 1)
         tail = (self._tail[k] + _LOOK_ALIKES / _TAIL_BINS) / (self._places + 1.0) * _TAIL_BINS
-        return float(target - np.logaddexp(background, np.log(np.sqrt(2.0 * np.pi) * tail)))
+        tail = np.sqrt(2.0 * np.pi) * tail * 0.5 * (1.0 + np.exp(other))
+        return float(target + other - np.logaddexp(background, np.log(tail)))
+
+    def tracking_ratio(self, score: float) -> float:
+        """log p(score | on the target) - log p(score | slipped on to the most similar place beside it), natural.
+
+        Both have a wide tail: a target that turns away, and a place that looks like it, come without notice.
+        """
+        t, r = self._target, self._rival
+        on = 0.9 * _density(min(score - t.mean, 0.0), max(t.std, _MIN_STD)) + 0.1
+        off = 0.95 * _density(max(score - r.mean, 0.0), max(r.std, _MIN_STD)) + 0.05
+        return float(np.log(on / off))
+
+    def observe_rival(self, score: float) -> None:
+        """Learn what the most similar place beside the target scores."""
+        self._rival.add(score)
 
     def confirm(self, score: float) -> None:
         """Learn what the target scores."""
         self._target.add(score)
-        self._target.std = max(self._target.std, 0.05)
 
     def observe_background(self, scores: Floats, places: float) -> None:
         """Learn what places beside the target score. scores: (n,) of the best; places: number of boxes searched."""
@@ -142,6 +162,10 @@ class TemplateMemory:
         b.std = 0.9 * b.std + 0.1 * max(float(scores.std()), 0.05)  # the spread over places, not that of their mean
         np.add.at(self._tail, np.clip((scores * _TAIL_BINS).astype(int), 0, _TAIL_BINS - 1), 1.0)
         self._places += places
+
+
+def _density(deviation: float, std: float) -> float:
+    return float(np.exp(-0.5 * (deviation / std) ** 2) / (std * np.sqrt(2.0 * np.pi)))
 
 
 def _weighted(features: Features) -> Features:

@@ -1,0 +1,133 @@
+"""Re-detection of a target that was away: where it is searched for, and how what is found is tested."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.uav.base import Image
+from edge.uav.correlation.candidate import Candidate, Kinematics
+from edge.uav.correlation.filter import Response
+from edge.uav.correlation.memory import TemplateMemory
+from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.correlation.search import search, tile
+from edge.uav.image_motion.scene_motion import Motion
+from protocols.geometry.types import Floats
+
+_MARGIN = 1.0  # log odds by which a place must exceed the next best one, and the one under test
+_ANYWHERE_RATE = 0.01  # at which a target is not near its prediction any more [1/s]
+_PROPOSED = -3.0  # log prior of a place that another tracker has found
+_PROMISING = 0.0  # log odds of a place under test above which others are searched in every second frame only
+_WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
+_MOST_TESTED = 2
+_DETECTION = 0.25  # probability that one search finds a target in view
+_CHANGE = 0.1  # std of the similarity of a target that has been away
+_MIN_INSIDE = 0.6  # share of a place in the image
+_TRIAL_SIZES = (0.9, 1.1)
+_FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
+_SIZES = (1.0, 0.87, 1.15, 0.75, 1.33)
+_ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1, 0.0, 1.57)
+
+Localise = Callable[[Image, OrientedBox], tuple[OrientedBox, Response]]
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Where the target is predicted: box; std of its centre, one coordinate [px]; how it moves; how long it is away."""
+
+    box: OrientedBox
+    std: float
+    motion: Kinematics
+    frames: int
+    seconds: float
+
+
+class Redetection:
+    """One absence. size: of the images [px]; localise: the box and the answer of the target's filter about a box."""
+
+    def __init__(self, size: tuple[int, int], memory: TemplateMemory, localise: Localise) -> None:
+        self._size, self._memory, self._localise = size, memory, localise
+        self._near = 1.0
+        self._tested: list[Candidate] = []
+        self._proposals, self._proposal_at = (
+            0,
+            0,
+        )  # how many; frame of the absence from which another tracker's place is tested
+        self.debug: dict[str, float] = {}
+
+    def move(self, motion: Motion, reach: float, dt: float) -> None:
+        """Predict the places under test into the next frame."""
+        for candidate in self._tested:
+            candidate.move(motion, reach, dt)
+
+    def propose(self, box: OrientedBox, expected: Prediction) -> None:
+        """Test a place that another tracker has found."""
+        if expected.frames >= self._proposal_at and not any(c.covers(box) for c in self._tested):
+            prior = float(np.logaddexp(self._log_prior(box.centre, expected), _PROPOSED))
+            self._tested.append(Candidate(box, prior, expected.motion))
+            # A wrong one must not leave no time for the search.
+            self._proposals += 1
+            self._proposal_at = expected.frames + 2 ** min(self._proposals, 4)
+
+    def look(self, image: Image, expected: Prediction, dt: float) -> Candidate | None:
+        """Search one image; the place that is taken for the target, if any: by its odds, and a margin over the next."""
+        self.debug = {}
+        self._tested = [c for c in self._tested if self._test(image, c, expected, dt)]
+        if not self._tested or self._tested[0].log_odds < _PROMISING or expected.frames % 2:
+            self._search(image, expected, dt)
+        self._tested.sort(key=lambda c: -c.log_odds)
+        del self._tested[_MOST_TESTED:]
+        if not self._tested:
+            return None
+        best = self._tested[0]
+        others = [c.log_odds for c in self._tested[1:]]
+        self.debug |= {"sum": best.log_odds, "next": max(others, default=-99.0), "near": self._near}
+        return best if best.accepted and best.log_odds > max(others, default=-np.inf) + _MARGIN else None
+
+    def _search(self, image: Image, expected: Prediction, dt: float) -> None:
+        """Take up the likeliest new place: in turn about the prediction, and in one tile after the other."""
+        box, k = expected.box, expected.frames
+        box = box.sized(box.sides * _SIZES[k // 2 % len(_SIZES)]).turned(_ANGLES[k // 2 % len(_ANGLES)])
+        reach = 3.0 * expected.std + 0.3 * box.sides
+        if k % 2:
+            box, reach = tile(box, self._size, k // 2)
+        else:
+            # Where it was expected and is not seen, it is less and less likely to be.
+            self._near *= 1.0 - _DETECTION * box.share_within(reach, self._size)
+        new = [f for f in search(image, self._memory, box, reach) if not any(c.covers(f.box) for c in self._tested)]
+        if not new:
+            return
+        priors = [self._log_prior(f.box.centre, expected) for f in new]
+        odds = [self._memory.log_ratio(f.score, _CHANGE) + prior for f, prior in zip(new, priors, strict=True)]
+        best = int(np.argmax(odds))
+        candidate = Candidate(new[best].box, priors[best], expected.motion)
+        if odds[best] > _WORTH_A_TEST and self._test(image, candidate, expected, dt):
+            self._tested.append(candidate)
+
+    def _log_prior(self, place: Floats, expected: Prediction) -> float:
+        """Log probability that the target is in the box about ``place`` (2,): near the prediction, or anywhere."""
+        area = expected.box.width * expected.box.height
+        variance = expected.std**2
+        squared = float(np.square(place - expected.box.centre).sum()) / variance
+        share = self._near / (self._near + 1.0 - np.exp(-_ANYWHERE_RATE * expected.seconds))
+        # Student's t with two degrees of freedom: what turns or brakes leaves the Gaussian.
+        near = np.log(share + 1e-12) - 2.0 * np.log1p(0.5 * squared) + np.log(min(area / (2.0 * np.pi * variance), 1.0))
+        return float(np.logaddexp(near, np.log((1.0 - share) * area / (self._size[0] * self._size[1]))))
+
+    def _test(self, image: Image, candidate: Candidate, expected: Prediction, dt: float) -> bool:
+        """Add a frame's evidence to a place; whether it may still be the target."""
+        box, answer = self._localise(image, candidate.box)
+        if candidate.hits == 0:
+            # Before another size or angle is believed: the last one, localised about the same place.
+            same, same_answer = self._localise(image, expected.box.at(candidate.box.centre))
+            if self._memory.score(image, same) > self._memory.score(image, box):
+                box, answer = same, same_answer
+        trials = [box, *(box.sized(f * box.sides) for f in (_TRIAL_SIZES if candidate.hits else _FIRST_SIZES))]
+        scores = [self._memory.score(image, trial) for trial in trials]
+        score, box = max(scores), trials[int(np.argmax(scores))]
+        evidence = self._memory.log_ratio(score, _CHANGE, answer.log_ratio)
+        candidate.add(box, evidence, dt)
+        self.debug |= {"score": score, "llr": evidence, "ratio": answer.ratio, "prior": candidate.prior}
+        return evidence > 0.0 and box.share_inside(self._size) > _MIN_INSIDE and not candidate.hopeless
