@@ -305,7 +305,8 @@ def _compare(found: Section, work: str, task: Task, quick: bool, with_scipy: boo
         found.missing.append(f"{work} beside Ceres: pyceres is not installed (extra bench)")
         return
     note = f"its own CPU without evaluations; {solved.whole_s:.2g} s with its residuals made in Python"
+    note = "; ".join(part for part in (size, note, comparison(solved.state)) if part)
+    must, beside = None if with_scipy else Limit("ratio", 0.6), float(np.median(peers))
     found.rows.append(
-        Row(work, mine, "s", "Ceres alone (pyceres)", float(np.median(peers)),
-            must=None if with_scipy else Limit("ratio", 0.6), reach=Limit("ratio", 1.0), note="; ".join(part for part in (size, note, comparison(solved.state)) if part))
-    )  # fmt: skip
+        Row(work, mine, "s", "Ceres alone (pyceres)", beside, must=must, reach=Limit("ratio", 1.0), note=note)
+    )
