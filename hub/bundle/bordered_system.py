@@ -9,6 +9,7 @@ length of the recording (Schur complement C - Bᵀ A⁻¹ B).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,15 @@ from scipy.sparse import csc_array
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT, SplineBasis
 from protocols.geometry.types import Floats, Ints
+
+try:  # what a product of scipy's sparse matrices ends in; here without its checks, and added in place
+    from scipy.sparse import _sparsetools
+
+    _csc_matvecs: Callable[..., None] | None = _sparsetools.csc_matvecs
+except (ImportError, AttributeError):
+    _csc_matvecs = None
+
+_ROWS_AT_ONCE = 1001  # products of so many fit a core's cache; no power of two, whose columns displace each other there
 
 BAND = 3 * SUPPORT
 """Upper bands stored: four control points of three coordinates."""
@@ -47,62 +57,67 @@ class PathBlocks:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._sums: Floats = np.zeros((size + SUPPORT, len(_PAIRS), 6))
+        self._sums: Floats = np.zeros(((size + SUPPORT) * len(_PAIRS), 6))
 
-    def add(self, index: Ints, weights: Floats, upper: Floats) -> None:
-        """Add (w wᵀ) ⊗ block of every row; index (n,), weights (n, 4), upper (6, n): 00, 01, 02, 11, 12, 22 of it."""
-        products = np.empty((len(index), len(_PAIRS)))
-        for p, (a, b) in enumerate(_PAIRS):
-            products[:, p] = weights[:, a] * weights[:, b]
-        columns = len(_PAIRS) * index[:, None] + np.arange(len(_PAIRS))
-        sums = sparse_row_sums(products, columns, np.ascontiguousarray(upper.T), self._sums.shape[0] * len(_PAIRS))
-        self._sums += sums.reshape(self._sums.shape)
-
-    def add_rows(self, index: Ints, weights: Floats, terms: Floats, weighted: Floats) -> tuple[Floats, Floats]:
+    def add_rows(self, index: Ints, weights: Floats, terms: Floats) -> tuple[Floats, Floats]:
         """Add the rows' normal matrix; returns its path-by-others block (3 size, p) and others-by-others block (p, p).
 
         terms: (2, 3 + p, n) derivatives of both image axes by the point and by p other columns (the residual may be
-        one); weighted: the same times the rows' weights. index (n,), weights (n, 4): control points of each row.
+        one), times the root of the rows' weights. index (n,), weights (n, 4): control points of each row.
         """
-        # The point's three rows of the normal matrix, over the point's and the other columns.
-        products = weighted[0, :3, None] * terms[0] + weighted[1, :3, None] * terms[1]
-        self.add(index, weights, products[_ROWS, _COLUMNS])
-        scatter = self.scatter(index, weights, products[:, 3:])
-        return scatter, weighted[0, 3:] @ terms[0, 3:].T + weighted[1, 3:] @ terms[1, 3:].T
-
-    def scatter(self, index: Ints, weights: Floats, values: Floats) -> Floats:
-        """Sum over rows of w ⊗ value: (3 size, p) of values (3, p, n)."""
-        return border_block(index, weights, values, 3 * self.size)
+        others = terms.shape[1] - 3
+        crossed, gram = np.zeros((self.size + SUPPORT, 3 * others)), np.zeros((others, others))
+        for first in range(0, len(index), _ROWS_AT_ONCE):
+            rows = slice(first, first + _ROWS_AT_ONCE)
+            u, v = terms[:, :, rows]
+            # The point's three rows of the normal matrix, over the point's and the other columns.
+            products = u[:3, None] * u
+            products += v[:3, None] * v
+            add_row_sums(
+                crossed, weights[rows], index[rows, None] + _SUPPORT, products[:, 3:].reshape(-1, u.shape[1]).T
+            )
+            pairs = weights[rows].T[_PAIR_FIRST] * weights[rows].T[_PAIR_SECOND]
+            columns = len(_PAIRS) * index[rows, None] + _PAIR_COLUMNS
+            add_row_sums(self._sums, pairs.T, columns, products[_ROWS, _COLUMNS].T)
+            gram += u[3:] @ u[3:].T + v[3:] @ v[3:].T
+        return crossed.reshape(-1, others)[: 3 * self.size], gram
 
     def band(self) -> Floats:
         """The band (12, 3 size) of the sum of all rows."""
-        out = np.zeros((BAND, 3 * self.size))
+        out, all_sums = np.zeros((BAND, 3 * self.size)), self._sums.reshape(-1, len(_PAIRS), 6)
         for p, (a, b) in enumerate(_PAIRS):
             for i in range(3):
                 for j in range(i if a == b else 0, 3):
-                    values = self._sums[: self.size - b, p, _UPPER[i][j]]
+                    values = all_sums[: self.size - b, p, _UPPER[i][j]]
                     out[BAND - 1 - 3 * (b - a) - j + i, 3 * b + j :: 3] += values
         return out
 
 
+_SUPPORT = np.arange(SUPPORT, dtype=np.int32)
 _PAIRS = tuple((a, b) for a in range(SUPPORT) for b in range(a, SUPPORT))
 _UPPER = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # index of (i, j) in the stored upper triangle
+_PAIR_FIRST, _PAIR_SECOND = (np.array(one) for one in zip(*_PAIRS, strict=True))
+_PAIR_COLUMNS = np.arange(len(_PAIRS), dtype=np.int32)
 _ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 
 def border_block(index: Ints, weights: Floats, values: Floats, size: int) -> Floats:
     """Sum over rows of w ⊗ value: (size, p) of values (3, p, n); size: three times the control points."""
-    width = values.shape[1]
-    columns = index[:, None] + np.arange(SUPPORT)
-    rows_first = np.ascontiguousarray(values.transpose(2, 0, 1)).reshape(-1, 3 * width)
-    return sparse_row_sums(weights, columns, rows_first, size // 3 + SUPPORT).reshape(-1, width)[:size]
+    _, width, rows = values.shape
+    out = np.zeros((size // 3 + SUPPORT, 3 * width))
+    add_row_sums(out, weights, index[:, None] + _SUPPORT, values.reshape(-1, rows).T)
+    return out.reshape(-1, width)[:size]
 
 
-def sparse_row_sums(weights: Floats, columns: Ints, values: Floats, size: int) -> Floats:
-    """Sums (size, p) over rows of weights (n, k) at columns (n, k) times values (n, p)."""
+def add_row_sums(out: Floats, weights: Floats, columns: Ints, values: Floats) -> None:
+    """Add to out (size, p) the sums over rows of weights (n, k) at columns (n, k) times values (n, p)."""
     rows, each = weights.shape
-    scatter = csc_array((weights.ravel(), columns.ravel(), each * np.arange(rows + 1)), shape=(size, rows))
-    return np.asarray(scatter @ values)
+    starts, places = np.arange(0, each * rows + 1, each, dtype=np.int32), columns.astype(np.int32).ravel()
+    if _csc_matvecs is None:
+        out += np.asarray(csc_array((weights.ravel(), places, starts), shape=(len(out), rows)) @ values)
+    else:
+        flat = np.ascontiguousarray(values).ravel()
+        _csc_matvecs(len(out), rows, values.shape[1], starts, places, weights.ravel(), flat, out.reshape(-1))
 
 
 def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats, metric: Floats) -> Floats:

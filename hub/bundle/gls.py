@@ -16,7 +16,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.sparse import csr_array
 
 from hub.bundle.adjustment import apply_step, gauge_tangent
-from hub.bundle.bordered_system import PathBlocks, sparse_row_sums
+from hub.bundle.bordered_system import PathBlocks, add_row_sums
 from hub.bundle.covariance import constrained_step
 from hub.bundle.datum.gauge import ControlPointTerms
 from hub.bundle.gauss_markov import GaussMarkov
@@ -254,7 +254,7 @@ def _step(
         terms = np.concatenate([jacobian, evaluation.residual[:, None]], axis=1)
         weight = np.where(evaluation.valid, part.white_information, 0.0)
         weighted = terms * weight
-        path_terms, camera_terms = blocks.add_rows(index, evaluation.weights, terms, weighted)
+        path_terms, camera_terms = blocks.add_rows(index, evaluation.weights, terms * np.sqrt(weight))
         border[:paths, camera_columns] += path_terms[:, :-1]
         gradient[:paths] += path_terms[:, -1]
         corner[np.ix_(camera_columns, camera_columns)] += camera_terms[:-1, :-1]
@@ -315,7 +315,8 @@ class SparseEntries:
         cells, cell = np.unique(index * span + knot, return_inverse=True)
         products = (weights[:, :, None] * knot_weights[:, None, :]).reshape(len(index), -1)
         width = products.shape[1]
-        sums = sparse_row_sums(products, width * cell[:, None] + np.arange(width), values.T, width * len(cells))
+        sums = np.zeros((width * len(cells), len(values)))
+        add_row_sums(sums, products, width * cell[:, None] + np.arange(width), values.T)
         control = 3 * (cells // span)[:, None] + 3 * np.arange(SUPPORT)
         shape = (len(cells), SUPPORT, 2, 3)
         row = np.broadcast_to(control[:, :, None, None] + np.arange(3), shape)

@@ -97,9 +97,10 @@ def assemble(
     for camera, one, weight in zip(residuals.cameras, residuals.evaluations, residuals.weights, strict=True):
         camera_columns = np.flatnonzero(columns // CAMERA_PARAMETERS == camera)
         jacobian = jacobians(one, state.cameras[camera], (columns[camera_columns] % CAMERA_PARAMETERS).tolist())
-        terms = np.concatenate([jacobian, one.residual[:, None]], axis=1)
-        weighted = terms * weight
-        path_terms, camera_terms = blocks.add_rows(one.index, one.weights, terms, weighted)
+        terms, root = np.empty((2, jacobian.shape[1] + 1, len(weight))), np.sqrt(weight)
+        np.multiply(jacobian, root, out=terms[:, :-1])
+        np.multiply(one.residual, root, out=terms[:, -1])
+        path_terms, camera_terms = blocks.add_rows(one.index, one.weights, terms)
         system.gradient_path += path_terms[:, -1]
         if len(camera_columns):
             system.border[:, camera_columns[0] : camera_columns[-1] + 1] = path_terms[:, :-1]

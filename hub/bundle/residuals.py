@@ -127,10 +127,12 @@ def evaluate_labels(
 
     A calibration board gives some thirty rows a label: numpy takes as long for one label as for all at once.
     """
-    pixels = np.concatenate([part.pixels[part.use] for part in parts])
-    time = camera.row_time(np.concatenate([part.time[part.use] for part in parts]), pixels)
+    used = [np.flatnonzero(part.use) for part in parts]
+    pixels = np.concatenate([part.pixels.take(rows, axis=0) for part, rows in zip(parts, used, strict=True)])
+    time = np.concatenate([part.time.take(rows) for part, rows in zip(parts, used, strict=True)])
+    time = camera.row_time(time, pixels)
     reference = camera.reference_time(time)
-    ends = np.cumsum([np.count_nonzero(part.use) for part in parts])
+    ends = np.cumsum([len(rows) for rows in used])
     supports = [
         paths.paths[part.label].basis.weights_and_derivatives(part_times, _EXTRAPOLATION_INTERVALS)
         for part, part_times in zip(parts, np.split(reference, ends[:-1]), strict=True)
@@ -141,7 +143,7 @@ def evaluate_labels(
     weights, slope_weights = (np.concatenate([support[i] for support in supports]) for i in (1, 2))
     inside = np.concatenate([support[3] for support in supports])
     points = weighted_sums(paths.control, index, weights)
-    information = np.concatenate([part.used_relative_std for part in parts]) ** -2.0
+    information = 1.0 / np.square(np.concatenate([part.used_relative_std for part in parts]))
     support = SplineSupport(paths.control, index, weights, slope_weights)
     return evaluate_points(camera, points, inside, time, pixels, support, information)
 
@@ -159,7 +161,9 @@ def evaluate_points(
     camera_points = camera.pose.rotation @ (points.T - camera.pose.position[:, None])
     z = camera_points[2]
     valid = inside & (z > 1e-9)
-    normalised = np.where(valid, camera_points[:2] / np.where(valid, z, 1.0), 0.0)
+    normalised = (
+        camera_points[:2] / z if valid.all() else np.where(valid, camera_points[:2] / np.where(valid, z, 1.0), 0.0)
+    )
     lens = camera.intrinsics
     distortion_jacobian = None
     if lens.fisheye:
@@ -168,7 +172,7 @@ def evaluate_points(
     else:
         distorted, distortion_jacobian = lens.distort(normalised.T)
         projected = lens.matrix[:2, :2] @ distorted.T + lens.matrix[:2, 2:]
-        valid &= np.hypot(normalised[0], normalised[1]) < lens.fold
+        valid &= normalised[0] * normalised[0] + normalised[1] * normalised[1] < lens.fold**2
     if not valid.all():
         normalised = np.where(valid, normalised, 0.0)
         projected = np.where(valid, projected, lens.matrix[:2, 2:])

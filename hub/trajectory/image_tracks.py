@@ -59,6 +59,11 @@ class SmoothTrack:
     focal: float
     discontinuities: Floats = field(default_factory=lambda: np.zeros(0))
     """(k,) times [s] at which the detector probably switched to another object."""
+    polynomials: Floats = field(init=False)
+    """(size - 3, 4, 2) of the spline: refinements evaluate it hundreds of times."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "polynomials", self.basis.polynomials(self.control))
 
     def at(self, time: Floats, derivative: int = 0) -> Floats:
         """Smoothed normalised coordinates (n, 2) (or their derivative); NaN in gaps."""
@@ -66,7 +71,7 @@ class SmoothTrack:
 
     def point_and_velocity(self, time: Floats) -> tuple[Floats, Floats]:
         """Smoothed normalised coordinates and their velocities [1/s], (n, 2) each; NaN in gaps."""
-        return self.basis.evaluate_with_derivatives(self.control, time)
+        return self.basis.evaluate_with_derivatives(self.polynomials, time)
 
     def scaled(self, factor: float) -> SmoothTrack:
         """The same track with its times multiplied by ``factor``."""

@@ -16,6 +16,8 @@ from protocols.geometry.types import Bools, Floats, Ints
 
 SUPPORT = 4
 """Control points with non-zero weight at one time (the order of a cubic spline)."""
+_POWERS = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6.0
+"""Coefficients of 1, u, u², u³ of the four weights."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,15 +127,22 @@ class SplineBasis:
             values[~inside] = np.nan
         return values
 
-    def evaluate_with_derivatives(self, control: Floats, time: Floats) -> tuple[Floats, Floats]:
-        """Values and first derivatives, (n, d) each, at ``time``; NaN outside the stretches."""
+    def polynomials(self, control: Floats) -> Floats:
+        """(size - 3, 4, d) coefficients of 1, u, u², u³ in the knot interval that begins at each control point."""
+        return np.asarray(
+            _POWERS @ np.lib.stride_tricks.sliding_window_view(control, SUPPORT, axis=0).transpose(0, 2, 1)
+        )
+
+    def evaluate_with_derivatives(self, polynomials: Floats, time: Floats) -> tuple[Floats, Floats]:
+        """Values and first derivatives, (n, d) each, at ``time``, of a spline's `polynomials`; NaN outside."""
         index, u, inside, width = self.locate(time)
-        values = weighted_sums(control, index, basis_weights(u))
-        slopes = weighted_sums(control, index, basis_weights(u, 1)) / width[:, None]
+        constant, first, second, third = polynomials.take(index, axis=0).transpose(1, 2, 0)
+        values = ((third * u + second) * u + first) * u + constant
+        slopes = ((3.0 * third * u + 2.0 * second) * u + first) / width
         if not inside.all():
-            values[~inside] = np.nan
-            slopes[~inside] = np.nan
-        return values, slopes
+            values[:, ~inside] = np.nan
+            slopes[:, ~inside] = np.nan
+        return values.T, slopes.T
 
     def scaled(self, factor: float) -> SplineBasis:
         """The same basis on a time axis scaled by ``factor``."""

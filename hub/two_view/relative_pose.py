@@ -17,6 +17,8 @@ from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
 
+_GENERATORS = so3.hat(np.eye(3))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePose:
@@ -41,8 +43,10 @@ class RelativePose:
     def tangents(self) -> Floats:
         """(5, 3, 3) derivatives of ``matrix`` by the local parameters of `retract`."""
         axes, cross = orthogonal_axes(self.direction), so3.hat(self.direction)
-        turns = [cross @ so3.hat(axis) @ self.rotation for axis in np.eye(3)]
-        return np.stack(turns + [so3.hat(axis) @ self.rotation for axis in axes])
+        out = np.empty((5, 3, 3))
+        np.matmul(cross, _GENERATORS @ self.rotation, out=out[:3])
+        np.matmul(so3.hat(axes), self.rotation, out=out[3:])
+        return out
 
     def retract(self, step: Floats) -> RelativePose:
         """The pose after a local step (5,): rotation vector [rad], then the direction along its two tangents."""
@@ -80,9 +84,8 @@ class FundamentalMatrix:
     def tangents(self) -> Floats:
         """(7, 3, 3) derivatives of ``matrix`` by the local parameters of `retract`."""
         matrix = self.matrix
-        turns = [so3.hat(axis) @ matrix for axis in np.eye(3)] + [matrix @ so3.hat(axis) for axis in np.eye(3)]
         along = (self.left * np.array([-np.sin(self.angle), np.cos(self.angle), 0.0])) @ self.right
-        return np.stack([*turns, along])
+        return np.concatenate([_GENERATORS @ matrix, matrix @ _GENERATORS, along[None]])
 
     def retract(self, step: Floats) -> FundamentalMatrix:
         """The matrix after a local step (7,): rotation vectors of left and of right, and the angle [rad]."""
@@ -179,11 +182,14 @@ def homography_residual(a: Floats, b: Floats) -> float:
     ha, (x, y, _) = scale_a @ homogeneous(a).T, scale_b @ homogeneous(b).T
     outer = ha[[0, 0, 0, 1, 1, 2]] * ha[[0, 1, 2, 1, 2, 2]]
     of_b = np.stack([np.ones_like(x), -x, -y, x * x + y * y], axis=1)
-    weight, none = np.ones(len(a)), np.zeros((3, 3))
+    weight, normal = np.ones(len(a)), np.zeros((9, 9))
     for _ in range(4):
         # Normal matrix of the DLT rows (ha, 0, -x ha) and (0, ha, -y ha).
         plain, by_x, by_y, by_both = (outer @ (of_b * np.square(weight)[:, None])).T[:, _SYMMETRIC_INDEX]
-        normal = np.block([[plain, none, by_x], [none, plain, by_y], [by_x, by_y, by_both]])
+        normal[:3, :3] = normal[3:6, 3:6] = plain
+        normal[:3, 6:] = normal[6:, :3] = by_x
+        normal[3:6, 6:] = normal[6:, 3:6] = by_y
+        normal[6:, 6:] = by_both
         homography = np.linalg.eigh(normal)[1][:, 0].reshape(3, 3)
         mapped = homography @ ha
         depth = np.where(np.abs(mapped[2]) > 1e-12, mapped[2], 1e-12)

@@ -104,16 +104,14 @@ class Intrinsics:
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         slope = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2)  # d radial / d r2
-        out = np.empty_like(normalised)
-        out[:, 0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-        out[:, 1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        jacobian = np.empty((len(normalised), 2, 2))
-        cross = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-        jacobian[:, 0, 0] = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
-        jacobian[:, 0, 1] = cross
-        jacobian[:, 1, 0] = cross
-        jacobian[:, 1, 1] = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
-        return out, jacobian
+        # Stored coordinate by coordinate: numpy is slow along axes of two.
+        out, jacobian = np.empty((2, len(normalised))), np.empty((2, 2, len(normalised)))
+        out[0] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        out[1] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        jacobian[0, 1] = jacobian[1, 0] = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+        jacobian[0, 0] = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+        jacobian[1, 1] = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+        return out.T, jacobian.transpose(2, 0, 1)
 
     def pixel_jacobian(self, normalised: Floats) -> Floats:
         """Derivative (n, 2, 2) of distorted pixels by undistorted normalised coordinates (n, 2)."""

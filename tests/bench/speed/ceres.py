@@ -18,7 +18,7 @@ import pyceres
 from hub.bundle.bordered_system import THIRD_DIFFERENCE
 from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, FreeParameters
 from protocols.geometry.types import Floats, Ints
-from tests.bench.speed.joint import SIGMA_PX, Stacked
+from tests.bench.speed.joint import Stacked
 
 _OF_A_CAMERA = 8
 
@@ -91,14 +91,14 @@ class _Pass:
 
     def _make(self, x: Floats) -> None:
         self.lines = []
-        for index, line in zip(self.index, self.whole.lines(x), strict=True):
+        for index, line, sigma in zip(self.index, self.whole.lines(x), self.whole.sigma, strict=True):
             # A row that crossed a knot keeps the control points of the start; the one it has lost hardly weighs.
             weights = line.weights.copy()
             later, earlier = line.index > index, line.index < index
             weights[later] = np.pad(line.weights[later, :3], ((0, 0), (1, 0)))
             weights[earlier] = np.pad(line.weights[earlier, 1:], ((0, 0), (0, 1)))
-            by_path = line.point_jacobian[:, :, None, :] * weights[:, None, :, None] / SIGMA_PX
-            self.lines.append((line.residual / SIGMA_PX, by_path, line.camera_jacobian[:, :, :_OF_A_CAMERA] / SIGMA_PX))
+            by_path = line.point_jacobian[:, :, None, :] * weights[:, None, :, None] / sigma
+            self.lines.append((line.residual / sigma, by_path, line.camera_jacobian[:, :, :_OF_A_CAMERA] / sigma))
 
 
 class _Rows(pyceres.CostFunction):
