@@ -388,35 +388,8 @@ class _PairSearch:
             coarse.keep_inliers(start, 1.0, offset, LTS_INLIER_PX)
         if coarse.count < _MIN_SAMPLES:
             return None
-        initial_misfit = float(np.sqrt(max(cost, 1.0)))
         noise = NoiseModel(s.sigma_px / a[0].focal, s.sigma_px / b[0].focal, s.rate_prior_std)
-        fixed = self.known_pose is not None
-        own = min(1.0, min(float(np.median([t.sigma_px for t in one])) for one in (a, b)) / s.sigma_px) ** 2
-        best: RefinementResult | None = None
-        repeats = 0
-        for count, (geometry, lower_bound) in enumerate(
-            self._initial_geometries(coarse, b, offset, initial_misfit, start)
-        ):
-            lower_bound = 0.0 if lts else lower_bound  # the samples were selected as inliers of that very matrix
-            if lower_bound > _PROMISING * own or (best is not None and best.cost < _CLOSE_TO_FUNDAMENTAL * lower_bound):
-                break
-            if count >= _MAX_STARTS and (best is None or best.cost > _PROMISING * own):
-                break
-            found = refine(
-                coarse, geometry, coarse.centre - offset, initial_misfit, noise, fixed_geometry=fixed, iterations=14
-            )
-            if found is None:
-                continue
-            if best is None or found.cost < (1.0 - _SAME_MINIMUM) * best.cost:
-                repeats = 0
-            if best is None or found.cost < (1.0 + _SAME_MINIMUM) * best.cost:
-                repeats += 1
-            if best is None or found.cost < best.cost:
-                best = found
-            if best.cost < _NOISE_COST * own:
-                break  # at the noise: no other start can fit better
-            if repeats >= _MIN_REPEATS and best.cost < _FAR_FROM_FUNDAMENTAL * lower_bound:
-                break  # several starts agree, and the cost is too low for a local minimum
+        best = self._best_start(coarse, b, offset, float(np.sqrt(max(cost, 1.0))), start, noise, lts)
         if best is None:
             return None
         rate = 1.0 / best.inverse_rate
@@ -435,13 +408,54 @@ class _PairSearch:
                 np.sqrt(best.cost),
                 noise,
                 inverse_rate=best.inverse_rate,
-                fixed_geometry=fixed,
+                fixed_geometry=self.known_pose is not None,
             )
             if again is None:
                 return None
             best, rate = again, 1.0 / again.inverse_rate
             offset = samples.centre - rate * best.intercept
         return samples.evaluate(best.cost, rate, offset, best.geometry)
+
+    def _best_start(
+        self,
+        coarse: Samples,
+        b: Sequence[SmoothTrack],
+        offset: float,
+        initial_misfit: float,
+        start: Floats | TwoViewGeometry | None,
+        noise: NoiseModel,
+        lts: bool,
+    ) -> RefinementResult | None:
+        """The best of the refined initial geometries of `_refine_candidate`; None if none can be refined."""
+        s, a = self.s, self.a
+        own = min(1.0, min(float(np.median([t.sigma_px for t in one])) for one in (a, b)) / s.sigma_px) ** 2
+        best: RefinementResult | None = None
+        repeats = 0
+        for count, (geometry, lower_bound) in enumerate(
+            self._initial_geometries(coarse, b, offset, initial_misfit, start)
+        ):
+            lower_bound = 0.0 if lts else lower_bound  # the samples were selected as inliers of that very matrix
+            lowest = np.inf if best is None else best.cost
+            if lower_bound > _PROMISING * own or lowest < _CLOSE_TO_FUNDAMENTAL * lower_bound:
+                break
+            if count >= _MAX_STARTS and lowest > _PROMISING * own:
+                break
+            fixed = self.known_pose is not None
+            found = refine(
+                coarse, geometry, coarse.centre - offset, initial_misfit, noise, fixed_geometry=fixed, iterations=14
+            )
+            if found is None:
+                continue
+            if found.cost < (1.0 - _SAME_MINIMUM) * lowest:
+                repeats = 0
+            repeats += found.cost < (1.0 + _SAME_MINIMUM) * lowest
+            if found.cost < lowest:
+                best, lowest = found, found.cost
+            if lowest < _NOISE_COST * own:
+                break  # at the noise: no other start can fit better
+            if repeats >= _MIN_REPEATS and lowest < _FAR_FROM_FUNDAMENTAL * lower_bound:
+                break  # several starts agree, and the cost is too low for a local minimum
+        return best
 
     def _initial_geometries(
         self,
