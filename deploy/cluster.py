@@ -26,11 +26,11 @@ from protocols.core.names import check_name
 _WORDS_BEFORE = {"detect": 1}
 """By command, how many words stand before its input."""
 _STATE = "jobs.json"
-_CONNECT_S = 20.0
+_CONNECT_S = 20.0  # s: a scheduler on the same network answers within one
 _RETRIES = 1
 """Of a job whose worker was lost."""
-_MAX_JOBS = 100_000
-_TEXT = 300
+_MAX_JOBS = 100_000  # of one command: a day of recordings of a thousand cameras
+_TEXT = 300  # characters of a failure that are kept
 
 
 @dataclass(frozen=True, slots=True)

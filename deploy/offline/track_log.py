@@ -20,7 +20,7 @@ from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import FLIGHT_IMAGE, UAV_INFO
 
-_FPS = 30.0
+_FPS = 30.0  # where the log does not tell
 
 
 class LoggedFlightImages:

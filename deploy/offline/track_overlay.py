@@ -13,11 +13,11 @@ from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 _MARGIN = 0.5  # fraction of the image size added on each side
-_MAX_CANVAS_PX = 1280
+_MAX_CANVAS_PX = 1280  # side of the overlay's picture: fits a screen
 _COLOURS = {TrackState.VISIBLE: (80, 220, 80), TrackState.COASTING: (40, 170, 255), TrackState.LOST: (60, 60, 230)}
 _LAYERS = {"road": (110, 80, 30), "tracks": (160, 160, 160)}
-_OTHER_LAYER = (0, 220, 220)
-_PARTICLE = (230, 120, 230)
+_OTHER_LAYER = (0, 220, 220)  # BGR
+_PARTICLE = (230, 120, 230)  # BGR
 
 
 class Overlay:

@@ -11,7 +11,7 @@ import numpy as np
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
-_EARTH_RADIUS_M = 6_378_137.0
+_EARTH_RADIUS_M = 6_378_137.0  # semi-major axis of the WGS 84 ellipsoid
 _ECCENTRICITY2 = 6.694379990141317e-3  # squared, of the WGS 84 ellipsoid
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from edge.uav.base import Estimate, Image, TrackState
 
 _COLOURS = {TrackState.VISIBLE: (80, 220, 80), TrackState.COASTING: (0, 170, 255), TrackState.LOST: (60, 60, 230)}
-_PARTICLE = (230, 120, 200)
+_PARTICLE = (230, 120, 200)  # BGR
 _MAX_PARTICLES = 150  # drawn
 _ARROW_MARGIN_PX = 14.0  # from the border to the tip of the arrow that points to a target outside the image
 

@@ -19,7 +19,7 @@ from protocols.session.calibration import Calibration
 
 _MOST_POINTS = 300
 """Datum points of one label; more do not change the similarity."""
-_FEWEST_POINTS = 30
+_FEWEST_POINTS = 30  # ten times what a similarity needs
 _CAMERA_WEIGHT = 0.1
 """Weight of all cameras together against the trajectories: enough where a path is straight, which leaves a rotation
 about it free."""

@@ -44,7 +44,7 @@ from protocols.session.rig import Rig
 
 _RECENT_S = 3.0
 """Span of the newest rows that are tested for a moved camera [s]."""
-_MIN_RECENT_ROWS = 30
+_MIN_RECENT_ROWS = 30  # before and after a move: as many as a camera of a network needs
 _MOVED_SHARE, _STEADY_SHARE = 0.4, 0.8
 """A camera was moved where fewer of its newest rows than the first fit, while more of its older ones than the second
 do: of a camera that stands still 90 % and more fit."""

@@ -37,8 +37,8 @@ Progress = Callable[[str, float], None]
 
 RATE_TOLERANCE = 0.01
 """Relative rate error above which times must have been made with a wrong frame rate: no clock is off by that much."""
-_FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
-_RATIO_TOLERANCE = 0.01
+_FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)  # common ones [1/s]
+_RATIO_TOLERANCE = 0.01  # relative: 29.97 counts as 30
 _SMALL_NETWORK = 8  # cameras up to which all failed guided searches are repeated over all lags
 _MIN_REDUNDANT = 3  # cameras from which on pairs are checked against each other
 _LONG_OVERLAP = 8.0  # s of common motion

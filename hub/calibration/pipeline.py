@@ -55,10 +55,10 @@ from protocols.session.rig import Rig
 if TYPE_CHECKING:
     from hub.distributed.solver import DistributedPoseSolver
 
-_LENS_ITERATIONS = 3
+_LENS_ITERATIONS = 3  # a bound: it stops where no lens changes
 _SMALL_BODY = 4  # points of a single tag
-_MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2
-_SAME_STEP_S = 2.0
+_MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2  # steps of all clocks in one recording; Gauss-Newton steps for each
+_SAME_STEP_S = 2.0  # s: closer than this it is the same step
 _ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
 _MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 

@@ -24,13 +24,13 @@ from protocols.geometry.types import Floats
 
 _SAMPLES = 80
 """Points of a track, evenly along its path in the image: where the target rests, more of them tell nothing."""
-_MIN_POINTS = 16
-_STEP_S = 0.1
-_FINE_STEPS = 5
+_MIN_POINTS = 16  # rows: more than the twelve unknowns of a linear resection
+_STEP_S = 0.1  # s: of the lag scan, refined afterwards
+_FINE_STEPS = 5  # finer by this factor, twice: to 4 ms
 _TRUNCATION_PX = 20.0
 """Residual from which a point counts as not explained; so does one outside the trajectory."""
-_MIN_EXPLAINED = 0.3
-_DISTINCT_S = 0.5
+_MIN_EXPLAINED = 0.3  # share of the truncated cost that the best lag has to remove
+_DISTINCT_S = 0.5  # s: nearer lags are one candidate
 _MIN_COST_RATIO = 1.1
 """Cost of the next best lag over the best one's."""
 _CANDIDATES, _CANDIDATES_PER_OCTAVE = 12, 3

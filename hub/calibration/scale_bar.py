@@ -15,7 +15,7 @@ from protocols.session.rig import Rig
 
 _SEEN_WITHIN = 0.2  # s: a camera observes a point at a time if it has an observation this near
 _SAMPLING_STEP = 0.05  # s between samples
-_MIN_SAMPLES = 10
+_MIN_SAMPLES = 10  # of a bar's length
 _MAX_LENGTH_SPREAD = 0.2  # relative robust spread of the length; more means that it is not rigid
 _CORRELATION_TIME = 0.25  # s between samples with independent errors
 _MIN_STD = 1e-4  # relative: lower bound of the std

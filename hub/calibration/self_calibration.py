@@ -32,7 +32,7 @@ MAX_FOCAL_STD = 0.02
 """Largest relative std of an estimated focal length; above it the camera is refused."""
 _DEFAULT_FIELD_OF_VIEW = np.deg2rad(60.0)
 _PRINCIPAL_POINT_STD = 0.012  # of the larger image side: distance of principal points from the image centre
-_K1_STD, _K2_STD = 0.15, 0.05
+_K1_STD, _K2_STD = 0.15, 0.05  # priors of distortion: typical of lenses up to 100 degrees
 _SINGULAR_VALUE_NOISE = 0.02  # relative difference of the singular values due to noise
 _LOG_FOCAL_STARTS = (-0.5, -0.25, 0.0, 0.25, 0.5)  # of two prior stds from the prior mean of log focal length
 _MIN_CAMERAS = 3  # two unknown lenses are undetermined if the optical axes intersect

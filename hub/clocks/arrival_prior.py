@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from hub.clocks.external_prior import ExternalClockPrior
 
-_INTERVAL_S = 2.0
-_INTERVALS = 15
-_MIN_INTERVALS = 3
+_INTERVAL_S = 2.0  # s: holds a frame with the smallest delay
+_INTERVALS = 15  # half a minute
+_MIN_INTERVALS = 3  # complete ones, whose spread is tested
 _MAX_SPREAD_S = 0.1
 """Largest difference of the intervals' smallest delays."""
 ERROR_BOUND_S = 0.15

@@ -34,11 +34,11 @@ MIN_STEP_S = 0.2
 """Smaller steps cannot be distinguished from late frames [s]."""
 _SCREENING_SIGMAS = 2.0
 """Excess delay, in usual deviations from the line, from which the changepoint test is made at all"""
-_BIN_S = 0.5
-_BASELINE_BINS, _MAX_BINS = 24, 60
+_BIN_S = 0.5  # s: the smallest delay of each counts
+_BASELINE_BINS, _MAX_BINS = 24, 60  # 12 s and 30 s
 _REFIT_BINS = 8
 """Bins after which the baseline is fitted again"""
-_FORGETTING = 1 / 32
+_FORGETTING = 1 / 32  # of the mean period: over 32 frames
 _SLOPE_LAG_BINS, _SLOPE_MEMORY = 24, 30
 """Slope statistics: how many bins behind the present, and averaged over how many refits of the baseline"""
 _FALSE_ALARM_SHARE, _FALSE_ALARM_WEIGHT = 0.5, 0.2
@@ -48,8 +48,8 @@ _RATE_REFINEMENT_BINS, _STEP_REFINEMENT_BINS = 40, 6
 """Bins for which a rate change and a step are refined"""
 _MIN_PRESTEP_BINS, _MAX_PRESTEP_BINS = 8, 20
 """Bins before a step that give its baseline"""
-_MAX_PERIODS = 120
-_MAX_NAME_LENGTH = 63
+_MAX_PERIODS = 120  # frames kept for the median period
+_MAX_NAME_LENGTH = 63  # as names of cameras have it
 _MAX_RUNS = 8
 """Runs of one camera's agent that are remembered"""
 

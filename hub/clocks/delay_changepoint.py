@@ -25,7 +25,7 @@ MIN_SCATTER_S = 2e-5
 """Lower bound of the scatter of delays [s]."""
 _MAX_EARLY_RATE_CHANGE = 6e-4
 """As MAX_RATE_CHANGE for the shorter windows: time services slew at 500 ppm. Faster changes need the longest window."""
-_DETECTION_SIGMAS = 6.0
+_DETECTION_SIGMAS = 6.0  # two in 10^9 by chance
 _RAMP_MISFIT = 0.15
 """Residual of a ramp relative to its height: its onset does not coincide with a bin"""
 _MAX_RAMP_TO_STEP_MISFIT = 0.3

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 MAX_CAMERA_DELAY_S = 0.1
 """Largest delay from exposure to time stamp [s], unknown to time services: frames stamped on arrival are late."""
-_TEST_SIGMAS = 3.0
+_TEST_SIGMAS = 3.0  # 0.3 % by chance
 _MAX_PRIORS = 1024
 """Cameras; as many as a hub has."""
 

@@ -15,7 +15,7 @@ import numpy as np
 from hub.clocks.change_detector import ClockChange
 from protocols.geometry.types import Floats
 
-_SECOND_NS = 1_000_000_000
+_SECOND_NS = 1_000_000_000  # ns
 _TIME_TOLERANCE_S = 1e-5
 """More than rounding, less than a frame interval."""
 

@@ -13,7 +13,7 @@ from protocols.session.calibration import Calibration
 
 SEGMENT_MIN_ROWS = 600
 """Detections in a new segment from which on it is calibrated by itself; until then the moved map is more precise."""
-_MAX_ALARMS = 32
+_MAX_ALARMS = 32  # a status has room for as many
 _MAX_CHANGES = 64
 """Changes of one camera's clock; who has more has no clock, and is no longer watched."""
 

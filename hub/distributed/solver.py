@@ -35,7 +35,7 @@ from protocols.session.rig import Rig
 
 _UPDATE_PERIOD_S = 0.1
 """Time between two updates of each node [s]."""
-_MAX_UPDATES = 600
+_MAX_UPDATES = 600  # of each node: a bound, a minute of them
 _RAW_OBSERVATIONS = 4096
 """Raw observations that a node keeps per neighbour; offline there is more memory than on a camera board."""
 _MIN_SIZE_STD = 0.03

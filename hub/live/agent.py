@@ -35,7 +35,7 @@ from protocols.topics import (
 )
 
 ROLE = "hub"
-_TICK_S = 0.05
+_TICK_S = 0.05  # s: of the hub's loop, below a frame at 15 Hz
 _ROUND_S = 0.012
 """Least time between two rounds: observations that arrive closer together are processed together."""
 _MESSAGES_S = 0.4
@@ -44,9 +44,9 @@ _BACKLOG_S = 2.0
 """After its start a hub gets what cameras had published before, all at once."""
 _FINISH_S = 20.0
 """Longest wait for the last answer when the hub is stopped."""
-_PROGRESS_S = 2.0
-_STATUS_S = 1.0
-_RIG_S = 5.0
+_PROGRESS_S = 2.0  # s: between two messages of progress
+_STATUS_S = 1.0  # s: between two statuses
+_RIG_S = 5.0  # s: between two looks at rig.toml
 _MAX_TEXT = 2000  # characters of a status message
 _NAMED_CAMERAS = 16  # that a status has counters of their own for
 _MEASURED_CAMERAS = 64

@@ -21,7 +21,7 @@ _ROWS_PER_S, _BURST_ROWS = 8_000.0, 32_000.0
 100 Hz sends after an outage of a minute."""
 _PEOPLE_PER_S = 600.0
 """Detections of people a second that are kept for calibration: twenty people at 30 Hz."""
-_REORDERED_S = 1.0
+_REORDERED_S = 1.0  # s: a frame may be late by as much, on its own clock
 
 
 @dataclass(slots=True)

@@ -11,7 +11,7 @@ from protocols.messages import syncline_pb2 as pb
 _MAX_WAITING_ROWS, _MAX_WAITING_IN_ALL = 40_000, 200_000
 """Messages and detections of one sender that wait, and of all, some 100 bytes each; the oldest are dropped, of who has
 most of them where all together have too many."""
-_LEAST_SHARE_S = 0.01
+_LEAST_SHARE_S = 0.01  # s of CPU a second that every sender has
 
 
 class FairShare:

@@ -55,7 +55,7 @@ _FORGOTTEN_S = 600.0
 """A camera that is not calibrated is not waited for after this time without a frame."""
 _VERIFY_ROWS, _VERIFY_S = 60, 15.0
 """Detections of two cameras that a reloaded calibration is verified with, and seconds after which it is dropped."""
-_VERIFY_EVERY_S = 0.5
+_VERIFY_EVERY_S = 0.5  # s: between two tests of a reloaded answer
 _ALL_HEARD_S = 3.0
 """How long the other cameras of a reloaded calibration are waited for, once two are heard of."""
 _SAME_CLOCK_S = 1.0

@@ -11,7 +11,7 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, TrajectoryTable
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 1  # of the messages
 
 
 def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[str, str]) -> pb.Calibration:

@@ -13,10 +13,10 @@ from contextlib import suppress
 
 from hub.live.solver import SolverAnswer, SolverJob, run_job
 
-_BUDGET_S = 60.0
-_MEMORY_BYTES = 3 << 30
-_NICENESS = 5
-_PARENT_CHECK_S = 1.0
+_BUDGET_S = 60.0  # s of CPU for one job
+_MEMORY_BYTES = 3 << 30  # of the solver's process
+_NICENESS = 5  # below the hub's own
+_PARENT_CHECK_S = 1.0  # s: a solver without its hub ends
 _THREAD_LIMITS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 

@@ -14,9 +14,9 @@ from hub.trajectory.image_tracks import ImageTrack
 from hub.two_view import relative_pose
 from hub.two_view.refinement import NoiseModel, PointPairs, RefinementResult, refine
 
-_MIN_ROWS = 12
-_INLIER_PX = 3.0
-_SEEDS = 4
+_MIN_ROWS = 12  # more than twice the five unknowns
+_INLIER_PX = 3.0  # six stds of a good detector
+_SEEDS = 4  # of RANSAC: one may end in a local minimum
 
 
 def solve_common_clock_pair(

@@ -21,9 +21,9 @@ from protocols.geometry.types import Floats
 LTS_INLIER_PX = 10.0
 """Distance [px] up to which a sample is an inlier of the geometry of an LTS scan."""
 _FIVE_POINT_SEEDS = 8  # random seeds of five-point hypotheses, each refined to convergence
-_START_SAMPLES, _START_ITERATIONS = 300, 60
-_FIVE_POINT_SUBSET = 150
-_MIN_IN_FRONT = 0.95
+_START_SAMPLES, _START_ITERATIONS = 300, 60  # enough to rank the minima, which are then refined with all samples
+_FIVE_POINT_SUBSET = 150  # pairs among which inliers are counted
+_MIN_IN_FRONT = 0.95  # cheirality, less an outlier in twenty
 _MAX_LAG_CHANGE = 0.1  # s from the fit's lag
 _LIKELIHOOD_MARGIN = 6.0  # chi-square between distinguishable geometries, by effective sample size
 _MIN_RATE_SIGNIFICANCE = 5.0  # std, by effective sample size: above it the motion determines the rate

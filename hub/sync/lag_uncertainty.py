@@ -22,12 +22,12 @@ _LENS_STD = (0.015, 0.012, 0.012, 0.02)
 _READOUT_STD = 0.02
 """Std of the rolling-shutter readout time [s] per unit of normalised height: about 15 ms for most images."""
 _CONSIDER_STD = np.array([*_LENS_STD, *_LENS_STD, _READOUT_STD, _READOUT_STD])
-_POSE_DOF = 5
+_POSE_DOF = 5  # rotation and direction
 _INTERCEPT, _INVERSE_RATE = _POSE_DOF, _POSE_DOF + 1
 _LEAVE_OUT_PARTS = 5  # contiguous folds of the samples
-_ITERATIONS = 20
+_ITERATIONS = 20  # a bound: it stops where the cost hardly decreases
 _MIN_RELATIVE_DECREASE = 1e-5  # of the cost, at which the iteration has converged
-_MAX_DAMPING = 1e6
+_MAX_DAMPING = 1e6  # no step decreases the cost any more
 
 
 @dataclass(frozen=True, slots=True, eq=False)

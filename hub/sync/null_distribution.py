@@ -36,9 +36,9 @@ _MAX_STRETCHES = 24  # of one camera
 _MIN_STRETCH_PAIRS = 25  # for a distribution
 _MIN_SUPPORT_RATIO = 0.5  # of the alignment's support, in a pair of stretches
 _LOW_QUANTILE = 0.1  # quantile of the misfits that, with the median, gives their spread
-_DOF_LIMITS = (0.3, 12.0)
+_DOF_LIMITS = (0.3, 12.0)  # where the chi-squared fit of a few misfits is stable
 _MIN_DOF = 0.5  # fewer count as none
-_BISECTIONS = 14
+_BISECTIONS = 14  # to 1e-4 of the interval
 _RECORDING_PER_STRETCH = 2.5  # moving time of the shorter recording over the longest stretch taken everywhere
 _MIN_LAG_SPAN = 3.0  # s of lags with similar support, for a distribution
 

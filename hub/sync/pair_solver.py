@@ -47,9 +47,9 @@ from hub.two_view.refinement import NoiseModel, RefinementResult, refine
 from hub.two_view.relative_pose import FundamentalMatrix, RelativePose, TwoViewGeometry
 from protocols.geometry.types import Floats
 
-_MIN_SAMPLES = 12
+_MIN_SAMPLES = 12  # more than the seven unknowns
 _NOISE_COST = 0.8  # mean robust cost at which a fit is at the noise: it is about 0.75 with the noise of the settings
-_PREDICTED_LAG_CANDIDATES = 3
+_PREDICTED_LAG_CANDIDATES = 3  # the window holds one or two minima
 _NO_FIT = "no alignment of the two tracks agrees with any geometry"
 _HARDLY_MOVES = "the point hardly moves while both could have seen it"
 _HARDLY_MOVES_AT_PREDICTED_LAG = (
@@ -75,7 +75,7 @@ _MAX_RATE_BLIND_SPAN = (
 _MAX_COST_RATIO = 0.2  # of the median cost of lags with similar support
 _SAME_LAG = 0.1  # s
 _MAX_REPETITIONS = 4  # other lags at which the solution's own geometry is tried
-_FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
+_FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)  # common ones [1/s]
 FRAME_RATE_RATIOS = tuple(
     sorted(
         {round(a / b, 9) for a in _FRAME_RATES for b in _FRAME_RATES if 0.4 < a / b < 2.5 and a != b},

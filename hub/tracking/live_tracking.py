@@ -28,11 +28,11 @@ from protocols.session.calibration import CameraCalibration
 _METRES = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 _TYPICAL_SPACING_M = 5.0
 """Assumed distance of cameras if the scale is unknown, until it is estimated from the heights of people."""
-_POSITION_TOLERANCE, _ANGLE_TOLERANCE = 1e-6, 1e-6
-_UP_EVERY_FRAMES = 20
+_POSITION_TOLERANCE, _ANGLE_TOLERANCE = 1e-6, 1e-6  # m, rad: a calibration that differs by less is the same
+_UP_EVERY_FRAMES = 20  # the vertical is estimated again
 _WAIT = 0.25
 """Of a frame interval above ``_SLOW_S``: how long an instant's other cameras are awaited after the last arrival."""
-_SLOW_S = 0.2
+_SLOW_S = 0.2  # s behind, from which tracking is reported as slow
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ _MAX_ROWS_PER_S = 500
 """Of one camera and label; more are a fault, and would cost the others their time."""
 _MAX_LABELS_PER_CAMERA = 64
 """Labels that one camera may have introduced and that have no track yet."""
-_NEVER_NS = -(2**62)
+_NEVER_NS = -(2**62)  # before every time stamp, and differences do not overflow
 _MAX_SMOOTHED = 4096
 """Smoothed messages that are kept for a caller who does not take them."""
 

@@ -15,7 +15,7 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 1  # of the messages
 _COASTING_AFTER_S = 0.35
 MARKER_COASTING_AFTER_S = 0.2
 _RECENT_NS = 500_000_000
@@ -23,7 +23,7 @@ _MIN_HEADING_SPEED_M_S = 0.25
 """Targets slower than this have no heading."""
 _HEAD_HEIGHT, _HEAD_WIDTH = 0.16, 0.13
 """Of head and face, as fractions of the height."""
-_MAX_PIXEL = 1e5
+_MAX_PIXEL = 1e5  # far outside every image
 
 
 def track_messages(

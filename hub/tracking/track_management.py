@@ -22,12 +22,12 @@ _INITIATION_WINDOW_NS = 250_000_000
 _MAX_ANCHORS = 4
 _ARRIVALS = 0.1
 """People expected to appear in a frame."""
-_MAX_TENTATIVE = 64
+_MAX_TENTATIVE = 64  # bounds the cost of a frame of clutter
 MAX_EXISTENCE = 0.99
 """Certainty is limited, so that a target that has left is given up: after two looks that miss it at 0.85."""
 _CONFIRMED, _DELETED = 0.9, 0.02
 """Existence probabilities."""
-_MIN_HITS = 2
+_MIN_HITS = 2  # two: one may be clutter
 _ALONE_S = 1.0
 """Age from which on a person on the floor whom one camera alone sees is confirmed: a part of the background that was
 taken for somebody is learned by then."""

@@ -40,7 +40,7 @@ _MODELS: dict[str, tuple[int, tuple[int, int, int, int], bool, tuple[int, ...]]]
     "RADIAL_FISHEYE": (5, (0, 0, 1, 2), True, (3, 4)),
     "OPENCV_FISHEYE": (8, (0, 1, 2, 3), True, (4, 5, 6, 7)),
 }
-_CENTRE = 0.5
+_CENTRE = 0.5  # px: COLMAP's pixel centres lie there, ours at 0
 
 
 def is_model(folder: Path) -> bool:

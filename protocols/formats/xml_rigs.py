@@ -24,8 +24,8 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
 FORMATS = ("qualisys", "vicon", "optitrack")
-_MAX_FILE = 1 << 24
-_QUALISYS_UNIT = 64.0
+_MAX_FILE = 1 << 24  # bytes: of a thousand cameras
+_QUALISYS_UNIT = 64.0  # of a pixel: Qualisys counts in 64ths
 _FROM_Y_UP = np.diag([1.0, -1.0, -1.0])  # the axes of a camera that looks along -z with y up, to OpenCV's
 
 

@@ -34,7 +34,7 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration
 from protocols.session.rig import METRES_PER_UNIT
 
-_MAX_CHAIN_ERROR = 1e-3
+_MAX_CHAIN_ERROR = 1e-3  # m, rad: two paths through the cameras agree to rounding
 _MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M")
 _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
 _FISHEYE = ("fisheye", "equidistant", "kannala_brandt")

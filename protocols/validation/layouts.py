@@ -27,7 +27,7 @@ _MAX_SIZE = 4096
 _MAX_LAYOUTS, _MAX_OF_SIZE = 512, 4
 _FIRST_LAYOUTS, _HITS_PER_LAYOUT = 64, 8
 """A layout costs about three checks: where shapes do not come again, no more of them are made."""
-_VARIABLE, _LITERAL, _TEXT = 0, 1, 2
+_VARIABLE, _LITERAL, _TEXT = 0, 1, 2  # kinds of a layout's parts
 _VARINTS = {0x08: 0, 0x20: 7, 0x28: 7, 0x30: 9, 0x38: 6}
 """Of an observation: most bytes of each varint, so that its bound holds (2⁵³, 2⁶², an hour); 0: as in the model."""
 _STRINGS = {0x12: _VARIABLE, 0x1A: _VARIABLE}

@@ -33,13 +33,13 @@ from protocols.core.ranges import (
 )
 from protocols.messages import syncline_pb2 as pb
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 1  # of the messages
 
-MAX_DETECTIONS = 4096
-MAX_CAMERAS = 1024
-MAX_NUMBERS = 256
-MAX_LABEL = 64
-MAX_TEXT = 4096
+MAX_DETECTIONS = 4096  # of one frame
+MAX_CAMERAS = 1024  # of a hub
+MAX_NUMBERS = 256  # of one list
+MAX_LABEL = 64  # characters
+MAX_TEXT = 4096  # characters
 
 
 class RejectionReason(Enum):
@@ -296,7 +296,7 @@ def _camera_calibration(camera: pb.CameraCalibration) -> None:
 
 _STATUS = frozenset({"solved", "refused", "collecting", "searching"})
 _HUB_STATES = frozenset({"", "collecting", "searching", "calibrated", "degraded", "refused"})
-MAX_RUNS = 65_536
+MAX_RUNS = 65_536  # of rows of one solver event
 _SCALES = frozenset({"metric", "arbitrary"})
 
 
@@ -475,7 +475,7 @@ def _node_state(message: pb.NodeState) -> None:
 
 
 ACTIONS = frozenset({"start_recording", "stop_recording", "recalibrate", "export"})
-MAX_PICTURE = 512 * 1024
+MAX_PICTURE = 512 * 1024  # bytes of a thumbnail
 
 
 def _command(message: pb.Command) -> None:
@@ -497,9 +497,9 @@ def _picture(message: pb.Picture) -> None:
 
 MAX_IMAGE = 1_000_000
 """Bytes of a compressed image; with the rest of its message it stays below MAX_PAYLOAD."""
-MAX_POINTS = 4096
-MAX_FAR_PIXEL = 1e7
-MAX_METRES = 1e7
+MAX_POINTS = 4096  # of one polyline
+MAX_FAR_PIXEL = 1e7  # far outside every image
+MAX_METRES = 1e7  # beyond any scene on the ground
 _TARGET_STATES = frozenset({"visible", "coasting", "lost"})
 
 

@@ -12,7 +12,7 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, read_calibration
 from protocols.session.rig import Rig
 
-_ANY_SIZE = 1_000_000
+_ANY_SIZE = 1_000_000  # px: larger than any image, so that none is refused for its size
 
 
 @dataclass(frozen=True, slots=True, eq=False)

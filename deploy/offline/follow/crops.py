@@ -39,7 +39,7 @@ _SHOULDERS, _HIPS, _SHOULDER_WIDTH = 0.18, 0.52, 0.30
 0.530 of the stature, and 0.259 across the shoulders; the arms add to that."""
 _MIN_SPEED_M_S = 0.25
 """Who walks more slowly may look anywhere."""
-_MIN_SIDE_PX = 6
+_MIN_SIDE_PX = 6  # a smaller crop shows nothing
 _MIN_INSIDE = 0.7
 """Share of a region that must be in the picture."""
 

@@ -28,7 +28,7 @@ from protocols.session.detections import DetectionRows, read_detections
 Kind = Literal["person", "vehicle"]
 BOXES_FILE = "boxes.csv"
 _BOX_COLUMNS = ("camera", "frame", "time", "x", "y", "width", "height")
-_MAX_PIXEL = 1e6
+_MAX_PIXEL = 1e6  # far outside every image
 _MAX_TIME_S = 9e9
 """Beyond it a time [s] does not fit into 64 bits of nanoseconds."""
 _MAX_EMPTY_PER_FRAME = 20

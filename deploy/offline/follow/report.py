@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _WIDTH, _LEFT, _RIGHT = 1000.0, 130.0, 70.0
 _MAX_ROWS = 150
 """Tracks in the timeline and in the table; longer ones first where there are more."""
-_UNFOLDED = 30
+_UNFOLDED = 30  # tracks; more are folded away
 _STYLE = (
     "<style>.walk{fill:none;stroke-width:2;stroke-linejoin:round;stroke-linecap:round}.walk.coasting{stroke-width:1.4;"
     "stroke-dasharray:3 4}.ghost{fill:none;stroke:#c9d1da;stroke-width:1}.seen.small{fill-opacity:.8}"

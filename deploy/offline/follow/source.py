@@ -30,7 +30,7 @@ Progress = Callable[[str, float], None]
 LOG_OF_VIDEOS = "detections.mcap"
 _MAX_ROWS = 2_000_000
 """Reference times at which tracks are wanted: 18 h at 30 Hz."""
-_MAX_TIME_NS = 2**62
+_MAX_TIME_NS = 2**62  # half of what 64 bits hold: differences do not overflow
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,7 +21,7 @@ from protocols.session.rig import METRES_PER_UNIT
 if TYPE_CHECKING:
     from deploy.offline.follow.calibration import GivenCalibration
 
-_FEET, _INCHES = 1.0 / 0.3048, 1.0 / 0.0254
+_FEET, _INCHES = 1.0 / 0.3048, 1.0 / 0.0254  # per metre, by definition
 _FACTORS = (1.0, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, _FEET, 1.0 / _FEET, _INCHES, 1.0 / _INCHES)
 _FRAMES = 60
 """Frames that are looked at, spread over the session: some hundred people."""

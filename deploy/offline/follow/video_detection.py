@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from edge.devices.playback.video_reader import VideoReader
 
 Progress = Callable[[str, float], None]
-_POLL_S = 0.2
+_POLL_S = 0.2  # s: between two looks at the workers
 _shares: Any = None  # in a worker process: the share of each video that is done
 
 

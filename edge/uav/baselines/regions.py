@@ -14,7 +14,7 @@ from protocols.geometry.types import Bools, Floats
 
 Labels = npt.NDArray[np.uint8]
 
-BUILDING, ROAD, OTHER = 0, 1, 2
+BUILDING, ROAD, OTHER = 0, 1, 2  # classes of the map
 COLOURS = np.array([[0, 0, 255], [255, 0, 0], [0, 255, 0]], dtype=np.uint8)
 """BGR of the labels as in (4.7) to (4.9)."""
 EXISTENCE = np.array([0.1, 1.0, 0.8], dtype=np.float32)

@@ -14,7 +14,7 @@ from edge.uav.base import Image
 
 Features = npt.NDArray[np.float32]
 
-ORIENTATIONS = 9
+ORIENTATIONS = 9  # as in Felzenszwalb's HOG
 CHANNELS = ORIENTATIONS + 3
 _CLIP = 0.4  # of a normalised histogram entry: one strong edge does not make the cell
 _NOISE_LEVEL = 4.0  # gradient [grey levels a pixel] of sensor noise and compression, which gets no unit contrast

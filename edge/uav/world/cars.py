@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from protocols.geometry.types import Floats
 
-LENGTH, WIDTH = 4.5, 1.9
+LENGTH, WIDTH = 4.5, 1.9  # m, of a usual car
 CENTRE_HEIGHT = 0.7  # m: height of the reference point taken as the car's centre
-_BODY_TOP, _ROOF_TOP = 0.85, 1.45
+_BODY_TOP, _ROOF_TOP = 0.85, 1.45  # m above the ground
 _SHIFT = 4  # fractional bits of OpenCV's fixed-point polygon coordinates
 _MIN_DEPTH = LENGTH  # m: smallest depth of a car's centre in the camera frame at which it is drawn
 _MAX_PIXEL = 1e5  # px: coordinates are clipped here, to keep fixed-point values in range

@@ -14,7 +14,7 @@ from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
 LEAD_S = 2.0  # s: the trajectory begins this long before the first frame
-GRID_HZ = 120.0
+GRID_HZ = 120.0  # of the planned path: twice the fastest camera
 BODY_FROM_DOWN_CAMERA: Floats = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Camera looking straight down, the top of the image forward."""
 

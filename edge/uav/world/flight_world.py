@@ -19,7 +19,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
-_NOISE_STREAM, _TELEMETRY_STREAM = 101, 102
+_NOISE_STREAM, _TELEMETRY_STREAM = 101, 102  # of random numbers, apart from the others
 _HEADING_BASELINE = 0.5  # m ahead of the centre: second point from which the heading in the image is computed
 _MIN_VISIBLE_SHARE = 0.05  # smallest visible share of another car that is listed in ``others``
 

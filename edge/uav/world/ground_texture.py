@@ -13,11 +13,11 @@ from edge.uav.world.noise import value_noise
 from edge.uav.world.roads import STEP, Road, crossing_outline
 from protocols.geometry.types import Floats
 
-METRES_PER_PIXEL = 0.1
-_SHIFT = 4
+METRES_PER_PIXEL = 0.1  # of the rendered ground
+_SHIFT = 4  # bits of OpenCV's fixed-point coordinates
 _GRASS, _SOIL, _YARD = (np.array(c, np.float32) for c in ((66, 112, 98), (104, 132, 150), (146, 150, 150)))
 _ASPHALT, _PAVEMENT, _PAINT = (np.array(c, np.float32) for c in ((94, 92, 90), (150, 156, 160), (224, 226, 226)))
-_PAVEMENT_WIDTH = 1.6
+_PAVEMENT_WIDTH = 1.6  # m
 _SHADOW_DEPTH = np.float32(0.42)
 
 

@@ -20,7 +20,7 @@ from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 NAME = "patrol"
-LONGEST_S = 3600.0
+LONGEST_S = 3600.0  # s: an hour
 _SIDES = (90.0, 60.0)  # straights of the block [m]
 _RADIUS = 20.0
 _FIRST_EXIT_S, _EXIT_INTERVAL_S = 6.0, 12.0

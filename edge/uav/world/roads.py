@@ -16,7 +16,7 @@ from protocols.geometry.types import Floats
 STEP = 0.5  # metres between the points of a curve
 _TRANSITION_LENGTH = 6.0  # m over which the curvature ramps up and down at a bend
 _CORNER_CUT = 5.0  # m of kerb by which the corners of a crossing are cut
-LANE = 3.5
+LANE = 3.5  # m, of a usual road
 ROAD_WIDTH = 2 * LANE
 
 

@@ -34,8 +34,8 @@ from hub.calibration.rigid_body.problem import BodyProblem, BodyState
 from hub.trajectory.splines import SplineBasis
 from protocols.session.calibration import AdjustmentStep
 
-_ROUNDS, _STEPS = 5, 20
-_TOLERANCE = 1e-5
+_ROUNDS, _STEPS = 5, 20  # of noise estimates; Levenberg-Marquardt steps in each
+_TOLERANCE = 1e-5  # relative decrease of the cost at which it has converged
 
 
 def adjust_bodies(problem: BodyProblem, state: BodyState) -> tuple[BodyProblem, BodyState]:

@@ -19,7 +19,7 @@ BLOCK = SUPPORT * POSE
 # Prior stds of a lens that only the board determines: wide, they matter where few views do not.
 _PRIOR_STD = {K1: 0.3, K2: 0.3, K3: 0.2, ASPECT: 2e-3, P1: 1e-3, P1 + 1: 1e-3}
 _CENTRE_STD = 0.02  # of the larger image side
-_RATE_STD = 1e-3
+_RATE_STD = 1e-3  # of a clock's rate: ten times a crystal's
 NORM_STD = 0.1
 """Of a control quaternion's squared norm about 1."""
 _RIDGE = 1e-10  # relative: gaps that only the smoothness prior bridges are singular to rounding

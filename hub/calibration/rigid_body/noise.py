@@ -16,7 +16,7 @@ from hub.trajectory.splines import SplineBasis
 from protocols.geometry.types import Bools, Floats
 
 _OUTLIER = 5.0  # sigma of the 2-D residual
-_MIN_SIGMA_PX = 0.03
+_MIN_SIGMA_PX = 0.03  # the best corner detectors reach 0.05 px
 _JITTER_QUANTILE = 0.999  # of chi-squared: time errors that noise of the image alone explains are none
 _MIN_SHAPE = 1e-5  # of the distance of neighbouring points
 _MIN_PRIOR = 1e-4  # of a path's scatter

@@ -27,7 +27,7 @@ Progress = Callable[[str, float], None]
 MAX_BOARD_FOCAL_STD = 0.05
 """Largest relative std of a focal length that the board determines; above it the camera is refused."""
 _MAX_ROTATION_STD, _MAX_CLOCK_FRAMES = 0.05, 0.5  # rad; frame intervals
-_MIN_INLIERS, _MIN_VIEWS = 0.5, 3
+_MIN_INLIERS, _MIN_VIEWS = 0.5, 3  # half of the views must agree; three views determine a pose and its check
 _MIN_SHAPE_POINTS = 6  # of a board: fewer are taken as described
 _SIGMA_START = 1.0  # px
 

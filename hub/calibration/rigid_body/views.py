@@ -12,7 +12,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.observations import Observations, Track
 
-_MIN_POINTS = 4
+_MIN_POINTS = 4  # four coplanar points determine a pose
 _FLAT = 1e-6  # relative: singular value of a planar body's points
 _MAX_RMS_PX = 5.0  # of a view's pose: more is a wrong detection
 _AMBIGUOUS = 3.0  # ratio of the rms of the two poses of a plane below which both are kept

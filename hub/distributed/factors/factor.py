@@ -46,9 +46,9 @@ _MAX_STREAM_EXCESS = 8.0
 """The same for streamed observations, which are linearised once: a poor point would reject good ones."""
 _RELINEARISE_CHI2 = 0.05
 """Chi2 by which the prediction may move before the raw observations are relinearised."""
-_MAX_STRIDE = 16
-_MIN_INLIER_RATE = 0.45
-_INLIER_RATE_GAIN = 1.0 / 24.0
+_MAX_STRIDE = 16  # of frames, where the pose hardly changes
+_MIN_INLIER_RATE = 0.45  # below it the neighbour's pose is not trusted
+_INLIER_RATE_GAIN = 1.0 / 24.0  # of the running mean: over 24 observations
 _MEMORY_LENGTH = 200_000.0
 """Observations after which the weight of the oldest has decayed to 1/e, for slow drift."""
 

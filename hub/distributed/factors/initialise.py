@@ -12,15 +12,15 @@ from protocols.geometry.types import Bools, Floats
 
 MIN_SIZED_OBSERVATIONS = 12
 """Shared observations with sizes needed for an initialisation."""
-MIN_BEARINGS = 24
+MIN_BEARINGS = 24  # five determine a relative pose; RANSAC wants a margin
 CHI2_GATE = 21.1
 """Chi2 of one observation (3 dof with sizes) above which it is an outlier."""
-CHI2_GATE_BEARINGS = 15.1
-_RANSAC_TRIALS = 60
-_MAX_ITERATIONS = 12
+CHI2_GATE_BEARINGS = 15.1  # quantile 1e-4 of one degree of freedom
+_RANSAC_TRIALS = 60  # finds five inliers of 60 % with 99 %
+_MAX_ITERATIONS = 12  # a bound: it stops where the cost hardly decreases
 _MIN_INLIER_SHARE = 0.6
 """Share of inliers below which an initialisation fails."""
-_MIN_EIGENVALUE = 1e-9
+_MIN_EIGENVALUE = 1e-9  # keeps the normal matrix invertible
 
 
 def chi2_gates(weights: Floats) -> Floats:

@@ -21,7 +21,7 @@ from protocols.geometry.types import Bools, Floats
 
 _MIN_DEPTH_SHARE = 1e-3
 """Least depth of a triangulated point, as a share of its distance."""
-_POINT_STEPS = 1
+_POINT_STEPS = 1  # Gauss-Newton steps: the linear point is near
 
 
 def small_log(rotation: Floats) -> Floats:

@@ -16,9 +16,9 @@ TIME_TOLERANCE_S = 1e-6
 """Times [s] that differ by less are equal."""
 MAX_GAP_S = 0.2
 """Longest time [s] between own observations across which a target is interpolated."""
-_OWN_CAPACITY = 16
-_PENDING_CAPACITY = 64
-_MAX_LABELS = 64
+_OWN_CAPACITY = 16  # frames: half a second at 30 Hz
+_PENDING_CAPACITY = 64  # frames of a neighbour: two seconds at 30 Hz
+_MAX_LABELS = 64  # of one node
 
 PairedRow = tuple[float, float, float, float, float, float, float, float, float, float]
 

@@ -20,7 +20,7 @@ from protocols.session.rig import Rig, RigCamera
 
 MIN_STD = 5e-5
 """Smallest std of a control point [rad, or share of the distance]: a stiffer one only slows convergence."""
-_MAX_ITERATIONS = 12
+_MAX_ITERATIONS = 12  # Gauss-Newton steps: a bound
 
 
 def accepted_anchors(anchors: dict[int, Anchor]) -> list[Anchor]:

@@ -37,7 +37,7 @@ from protocols.session.observations import DEFAULT_LABEL
 
 ROLE = "nodes"
 """Role under which a hub that hosts pose nodes is announced."""
-_UPDATE_PERIOD_S = 0.1
+_UPDATE_PERIOD_S = 0.1  # s: ten publications a second
 _UPDATE_OBSERVATIONS = 40
 """Observations after which the nodes are updated even if no time has passed, for a hub that has a backlog."""
 _CHECKPOINT_UPDATES = 5
@@ -46,11 +46,11 @@ _LISTEN_S = 1.0
 """Time after the start during which cameras that another host may have are not taken over."""
 _TIMEOUT_S = 20.0
 """Time without messages after which a host counts as failed even if its liveliness token is present."""
-_MIN_UPDATES = 30
-_PIXEL_STD = 1.0
-_MIN_PIXEL_STD = 0.3
-_SIZE_STD = 0.05
-_MAX_CLOCK_CHANGE_S = 0.02
+_MIN_UPDATES = 30  # before a node's pose is published
+_PIXEL_STD = 1.0  # px, until it is estimated
+_MIN_PIXEL_STD = 0.3  # px
+_SIZE_STD = 0.05  # relative
+_MAX_CLOCK_CHANGE_S = 0.02  # s: a larger change starts the association anew
 _LENS_TOLERANCE = 1e-3
 """Relative change of a focal length from which a lens counts as changed."""
 

@@ -15,7 +15,7 @@ from protocols.geometry.types import Floats
 
 _MIN_OBSERVATIONS = 50.0
 """Observations from which the residuals determine the variance factor."""
-_SINGULAR = 1e-12
+_SINGULAR = 1e-12  # relative eigenvalue, below which a direction is not determined
 
 Edges = Mapping[tuple[str, str], QuadraticFactor]
 """By pair, the camera with the lower number (and name) first, as parametrised in `hub.distributed.factors.factor`."""

@@ -50,7 +50,7 @@ _RESECTION_INTERVAL = 20
 """Updates between two attempts to localise by resection."""
 _STARTUP_UPDATES = 100
 """Updates after joining a frame during which observations are processed without delay."""
-_MAX_ANCHORS = 8
+_MAX_ANCHORS = 8  # neighbours that a node's pose is chained to
 _CONTROL_TEST_AT = 80
 """Updates after joining, and again at each doubling, at which control points are tested; they have no weight before."""
 _MAX_ROTATION_STEP = 0.3
@@ -66,7 +66,7 @@ _TIMEOUT_UPDATES = 20
 _CONVERGED_CHI2, _CONVERGED_UPDATES = 9.0, 5
 """Largest predicted chi2 decrease of a step, and for how many successive updates, for the moved-camera test."""
 _CONTRADICTION_COST = 60.0
-_MAX_CONTRADICTIONS = 30
+_MAX_CONTRADICTIONS = 30  # in succession, before the pose is started anew
 
 
 class PoseNode:

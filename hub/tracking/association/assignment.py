@@ -26,7 +26,7 @@ POINT_GATE = 18.4
 """Gate of the representative point: false-rejection probability 1e-4 (chi2, 2 dof)."""
 PART_GATE = 13.8
 """Gate of head and foot: false-rejection probability 1e-3; outside it, that point is not used."""
-_SIZE_GATE = 9.0
+_SIZE_GATE = 9.0  # chi-squared, three stds
 _LOG_OUTLIER = float(np.log(0.05))
 """Of a head or foot outside its gate, while the point is inside: occluded or merged silhouettes, one in twenty."""
 _CLUTTER_RADIUS = 0.25

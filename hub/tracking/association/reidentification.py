@@ -15,7 +15,7 @@ from protocols.geometry.types import Bools, Floats
 
 _COLOUR_STD = 18.0
 """Of one channel of the mean colour of one target between two appearances."""
-_LOG_SIZE_STD = 0.05
+_LOG_SIZE_STD = 0.05  # of a person's height from one appearance to the next
 _MAX_MOTION_S = 4.0
 """A target lost for longer may be anywhere: only its appearance is compared."""
 _MAX_COST, _MIN_MARGIN = 14.0, 4.0

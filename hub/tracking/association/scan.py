@@ -33,8 +33,8 @@ from hub.tracking.filter.target_states import ScanFrame, Targets
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats, Ints
 
-MAX_SWEEPS = 4
-MAX_LOG_ODDS = 9.0
+MAX_SWEEPS = 4  # of coordinate descent over the frames of a scan
+MAX_LOG_ODDS = 9.0  # e^9: no single measurement may decide by more
 AMBIGUOUS = 0.95
 """Association probability below which a frame's association is repeated with the others of its scan."""
 

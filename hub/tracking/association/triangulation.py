@@ -19,7 +19,7 @@ _MAX_NOISE_FACTOR = 9.0
 """The noise may be three times the calibration's, because clocks and poses drift after it."""
 _MAX_RELATIVE_STD = 0.3
 """Of the position, as a fraction of the distance: beyond it, the linearisation does not hold."""
-_GAUSS_NEWTON_STEPS = 4
+_GAUSS_NEWTON_STEPS = 4  # the linear point is near
 
 
 def initial_motion(rows: Sequence[MarkerRow]) -> tuple[Floats, Floats, float] | None:

@@ -17,9 +17,9 @@ CORRELATION_S = 0.5
 walk behind things. A frame counts as the fraction of it that has passed since the camera's last one."""
 _GAIN = 0.03
 """Of the running estimates, for each target or frame: a time constant of a hundred."""
-_PROBABILITY = (0.1, 0.98)
-_CLUTTER = (0.02, 50.0)
-_NOISE = (0.5, 16.0)
+_PROBABILITY = (0.1, 0.98)  # limits of the estimate: neither certain nor impossible
+_CLUTTER = (0.02, 50.0)  # limits, false detections a frame
+_NOISE = (0.5, 16.0)  # limits, of the stated variance
 _PERSON = KIND_INDEX["person"]
 _OTHER_OBJECTS = 1e-3
 """Expected detections of markers and vehicles that are not tracked: others are rare, so that even a poor fit is the

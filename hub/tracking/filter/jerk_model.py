@@ -9,7 +9,7 @@ import numpy as np
 
 from protocols.geometry.types import Floats
 
-STATE_DIM = 9
+STATE_DIM = 9  # position, velocity, acceleration
 POSITION, VELOCITY = slice(0, 3), slice(3, 6)
 _POWERS = np.arange(6)
 _STEP = np.zeros((6, STATE_DIM, STATE_DIM))

@@ -9,7 +9,7 @@ import numpy as np
 
 from protocols.geometry.types import Bools, Floats
 
-STATE_DIM = 7
+STATE_DIM = 7  # position, velocity, log size
 POSITION, VELOCITY, LOG_SIZE = slice(0, 3), slice(3, 6), 6
 
 

@@ -9,7 +9,7 @@ from hub.tracking.detections import MIN_STD_PX, TrackingCamera
 from protocols.geometry.camera import Intrinsics
 from protocols.messages import syncline_pb2 as pb
 
-_NEWTON_STEPS, _TOLERANCE = 20, 1e-11
+_NEWTON_STEPS, _TOLERANCE = 20, 1e-11  # it converges quadratically
 
 
 @dataclass(frozen=True, slots=True, eq=False)

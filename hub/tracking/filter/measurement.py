@@ -20,7 +20,7 @@ POINT, HEAD, FOOT, LOG_IMAGE_SIZE = slice(0, 2), slice(2, 4), slice(4, 6), 6
 BLOCKS = (POINT, HEAD, FOOT, slice(LOG_IMAGE_SIZE, MEASUREMENT_DIM))
 _LOG_SIZE_STD = 0.08
 """Of the measured log image size: silhouette sizes fluctuate."""
-_MIN_DEPTH = 1e-3
+_MIN_DEPTH = 1e-3  # m: nearer points have no image
 _STUDENT_T_DOF = 4.0
 """Degrees of freedom of the Student's t noise of heads and feet: truncated or merged silhouettes cause outliers."""
 

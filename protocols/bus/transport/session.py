@@ -18,7 +18,7 @@ from protocols.bus.security.tls import check_files, refusal_reason
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import InputError
 
-MAX_MESSAGE_SIZE = 4 * 1024 * 1024
+MAX_MESSAGE_SIZE = 4 * 1024 * 1024  # bytes: eight of the largest pictures
 LEASE_MS = 1900
 """A frozen process counts as gone after this and is reported within 2 s; a killed one at once."""
 _ATTEMPTS_MS = (100, 1000, 2000)

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 
 _BUILDER, _STATISTICS = "_Writer__chunk_builder", "_Writer__statistics"
 _MESSAGE = struct.Struct("<BQHIQQ")
-_HEAD = 2 + 4 + 8 + 8
+_HEAD = 2 + 4 + 8 + 8  # bytes: channel, sequence, two times
 
 
 class _Index(array):  # type: ignore[type-arg]

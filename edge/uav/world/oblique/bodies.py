@@ -15,8 +15,8 @@ from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
 Colour = tuple[int, int, int]
-_SHIFT = 4
-_NEAR_M = 0.5
+_SHIFT = 4  # bits of OpenCV's fixed-point coordinates
+_NEAR_M = 0.5  # m: nearer faces are clipped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
