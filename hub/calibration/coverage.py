@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from google.protobuf.message import Message
 
 from hub.report.measures import COLUMNS, ROWS, covered_cells
 from protocols.geometry.types import Bools
-from protocols.messages import syncline_pb2 as pb
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
 
 MIN_COVERAGE = 0.35
 """Share of the image cells in which the marker should have been seen."""
@@ -61,6 +62,8 @@ class CoverageMonitor:
 
     def handle(self, message: Message) -> None:
         """Add a CameraInfo or an Observation; other messages are ignored."""
+        from protocols.messages import syncline_pb2 as pb  # a session folder needs no messages
+
         if isinstance(message, pb.CameraInfo):
             self._sizes[message.camera] = (message.width, message.height)
             self._counts.setdefault(message.camera, np.zeros((ROWS, COLUMNS), dtype=np.int64))

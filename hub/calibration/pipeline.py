@@ -24,7 +24,7 @@ from hub.bundle.initialisation import (
 )
 from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
-from hub.bundle.problem import AdjustmentState, CameraState, ClockStep, FreeParameters, Problem
+from hub.bundle.problem import AdjustmentState, CameraState, FreeParameters, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.acceptance import (
@@ -468,13 +468,9 @@ def in_rig_order(refused: dict[str, str], prepared: PreparedSession) -> dict[str
     return {name: refused[name] for name in prepared.camera_order if name in refused}
 
 
-def _with_clock_steps(
-    problem: Problem, state: AdjustmentState, step: ClockStep | None
-) -> tuple[Problem, AdjustmentState]:
-    """Problem and state with the rows after clock steps corrected, as far as these explain the observations better.
-
-    step: the first one, of `find_clock_step`.
-    """
+def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+    """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
+    step = model_comparison.find_clock_step(problem, state)
     for _ in range(_MAX_CLOCK_STEPS):
         if step is None:
             break
@@ -518,14 +514,13 @@ def final_adjustment(
         refitted = _refit_online(problem, state, refine_lenses)
         if refitted[1] is not state:
             return _with_state(reconstruction, *refitted)
-    if not online and np.any(state.sigma > sigma_limits(state)) and wrong_lens(problem, state) is not None:
-        return reconstruction  # the camera will be left out
+    if not online and np.any(state.sigma > sigma_limits(state)):
+        lens, step = wrong_lens(problem, state), model_comparison.find_clock_step(problem, state)
+        if lens is not None and (step is None or step.statistic < lens.statistic):
+            return reconstruction  # the camera will be left out
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     if not online:
-        step, lens = model_comparison.find_clock_step(problem, state), wrong_lens(problem, state)
-        if lens is not None and (step is None or step.statistic < lens.statistic):
-            return _with_state(reconstruction, problem, state)
-        problem, state = _with_clock_steps(problem, state, step)
+        problem, state = _with_clock_steps(problem, state)
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
     problem = model_comparison.with_crystal_rates(problem, state)
     if refine_lenses and not warm:
