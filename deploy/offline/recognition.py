@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from edge.detectors.base import Detector
 from edge.detectors.board.description import BOARD_FILE, Board, BoardKind, load_dictionary, read_board
 from edge.detectors.board.detector import SEARCH_PX, BoardDetector
 from edge.detectors.board.finder import Finder
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.devices.base import Image
-from edge.devices.playback.video_reader import VideoReader
+from edge.devices.playback.video_reader import VideoFrame, VideoReader
 from edge.offline.sampling import sample_images
 from protocols.core.errors import InputError, Refused
 
@@ -36,6 +36,9 @@ _DICTIONARIES = (
     "4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000",
     "APRILTAG_36H11", "APRILTAG_25H9", "APRILTAG_16H5", "APRILTAG_36H10", "ARUCO_MIP_36H12", "ARUCO_ORIGINAL",
 )  # fmt: skip
+_CELL, _LEAST_CHANGE, _CHANGE_SIGMAS = 8, 4.0, 6.0  # px; grey levels, and stds of the noise of a cell's mean
+_LOOK_S = 6.0  # of a video, around the largest change, in which a person or a vehicle is searched
+_LEAST_SEEN = 10  # frames of these in which it is seen: a shorter track is of nothing
 _EXAMPLE = 'board = "charuco", squares = "8x5", square_size = 0.03 [m]'
 
 Grey = npt.NDArray[np.uint8]
@@ -87,6 +90,8 @@ def find_target(folder: Path, videos: Sequence[Path], detector: str, model: Mark
 
 def _look(looks: _Looks, board: Board | None, model: MarkerModel) -> Target:
     tried = []
+    if sum(bool(looks.changing(path)) for path in looks.paths) < _LEAST_VIDEOS:
+        raise _nothing(["what changes between some frames of a video, anywhere in the image"])
     if board is not None:
         described, videos = looks.print_of(board)
         if videos >= _LEAST_VIDEOS:
@@ -127,7 +132,11 @@ def _look(looks: _Looks, board: Board | None, model: MarkerModel) -> Target:
         if looks.moving(kind) >= _LEAST_VIDEOS:
             return Target(kind, None, (f"auto: a moving {kind}",))
         tried.append(f"one moving {kind}")
-    raise Refused(
+    raise _nothing(tried)
+
+
+def _nothing(tried: list[str]) -> Refused:
+    return Refused(
         f"nothing that moves was found in at least {_LEAST_VIDEOS} videos; tried: {', '.join(tried)}; name it with "
         "--detector, describe a board in board.toml, or teach a marker with `syncline detect marker --teach`"
     )
@@ -137,29 +146,48 @@ class _Looks:
     """A few frames of every video, decoded when they are first needed."""
 
     def __init__(self, videos: Sequence[Path], progress: Progress) -> None:
-        self._paths, self._progress = videos, progress
+        self.paths, self._progress = videos, progress
         self._samples: dict[Path, list[Image]] = {}
+        self._changes: dict[Path, list[Grey]] = {}
         cv2.setNumThreads(1)
 
     def images(self, path: Path) -> list[Image]:
         """Sampled images of a video; none where it cannot be read."""
         if path not in self._samples:
-            self._progress(f"looking at {path.name}", len(self._samples) / len(self._paths))
+            self._progress(f"looking at {path.name}", len(self._samples) / len(self.paths))
             try:
                 self._samples[path] = list(sample_images(VideoReader(path), _SAMPLES))
             except InputError:
                 self._samples[path] = []
         return self._samples[path]
 
-    def _show(self, path: Path, text: str, share: float) -> None:
-        self._progress(f"{path.name} {text}", share)
+    def changes(self, path: Path) -> list[Grey]:
+        """By sampled image, the cells of ``_CELL`` px (rows, columns) that are not as in most of the others: 1, else 0.
+
+        What moves is among them; with fewer than three images every cell is.
+        """
+        if path not in self._changes:
+            cells = [_cells(_grey(image)) for image in self.images(path)]
+            if len(cells) < 3:
+                self._changes[path] = [np.ones(one.shape, dtype=np.uint8) for one in cells]
+            else:
+                off = np.stack(cells) - np.median(cells, axis=0)
+                off -= np.median(off, axis=(1, 2), keepdims=True)  # the camera's exposure
+                limit = max(_LEAST_CHANGE, _CHANGE_SIGMAS * 1.4826 * float(np.median(np.abs(off))))
+                self._changes[path] = list((np.abs(off) > limit).astype(np.uint8))
+        return self._changes[path]
+
+    def changing(self, path: Path) -> list[int]:
+        """The sampled images in which something changes, most first."""
+        counts = [int(np.count_nonzero(one)) for one in self.changes(path)]
+        return [index for index in np.argsort(counts)[::-1].tolist() if counts[index]]
 
     def print_of(self, board: Board) -> tuple[Board, int]:
         """The print of a board in which most corners are found, and the number of videos with it."""
         best, most, seen = next(iter(board.prints())), 0, 0
         for print_ in board.prints():
             counts = []
-            for path in self._paths:
+            for path in self.paths:
                 detector = BoardDetector(print_)
                 found = [len(detector.find(_grey(image))[0]) for image in self.images(path)]
                 counts.append((sum(found), sum(count >= 4 for count in found)))
@@ -170,7 +198,7 @@ class _Looks:
 
     def tags(self, dictionaries: Sequence[str]) -> tuple[Board, set[int]] | None:
         """Single tags of the dictionary of which most are seen again and again, and their numbers."""
-        videos = [[_small(_grey(image)) for image in self.images(path)] for path in self._paths[:_LOOK_AT]]
+        videos = [[_small(_grey(image)) for image in self.images(path)] for path in self.paths[:_LOOK_AT]]
         black, either = cv2.aruco.DetectorParameters(), cv2.aruco.DetectorParameters()
         black.minMarkerPerimeterRate = either.minMarkerPerimeterRate = _LEAST_PERIMETER
         either.detectInvertedMarker = True
@@ -193,7 +221,7 @@ class _Looks:
         count = max(numbers) + 1
         if not _LEAST_SHEET <= count < 2 * len(numbers):
             return None
-        images = [_small(_grey(image)) for path in self._paths for image in self.images(path)[::3]]
+        images = [_small(_grey(image)) for path in self.paths for image in self.images(path)[::3]]
         best, most = None, 0.0
         for columns, rows in itertools.product(range(3, count + 1), repeat=2):
             if columns * rows // 2 != count:
@@ -210,7 +238,7 @@ class _Looks:
     def chessboard(self) -> tuple[int, int] | None:
         """Squares of the chessboard that most frames show; None where there is none."""
         sizes: Counter[tuple[int, int]] = Counter()
-        for path in self._paths[:_LOOK_AT]:
+        for path in self.paths[:_LOOK_AT]:
             for image in self.images(path):
                 flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
                 found, corners, meta = cv2.findChessboardCornersSBWithMeta(_small(_grey(image)), (4, 4), flags)
@@ -222,38 +250,60 @@ class _Looks:
         size, count = sizes.most_common(1)[0]
         return size if count >= _LEAST_FRAMES * _LEAST_VIDEOS else None
 
-    def single(self, make: Callable[[tuple[int, int]], object], share: float) -> int:
+    def single(self, make: Callable[[tuple[int, int]], Detector], share: float) -> int:
         """Number of videos in which a detector of single points finds something in a share of the frames, moving."""
         videos = 0
-        for path in self._paths:
+        for path in self.paths:
             images = self.images(path)
+            if len(self.changing(path)) < _LEAST_FRAMES:
+                continue
+            detector = make((images[0].shape[1], images[0].shape[0]))
             places = []
-            for image in images:
-                size = image.shape[1], image.shape[0]
-                found = make(size).detect(image)  # type: ignore[attr-defined]
-                if len(found) == 1:
-                    places.append((found[0].u / size[0], found[0].v / size[0]))
+            for image, changed in zip(images, self.changes(path), strict=True):
+                found = detector.detect(image)
+                if len(found) == 1 and _is_in(changed, found[0].u, found[0].v):
+                    places.append((found[0].u / image.shape[1], found[0].v / image.shape[0]))
             moved = len(places) >= 2 and float(np.ptp(places, axis=0).max()) > 0.02
             videos += len(places) >= max(share * len(images), _LEAST_FRAMES) and moved
         return videos
 
     def moving(self, kind: str) -> int:
         """Number of videos in which a detector of moving objects confirms one."""
-        from edge.offline.moving import detect_moving, moving_detector
+        from edge.offline.detections import Collected, run_detector
+        from edge.offline.moving import confirmed_labels, moving_detector
 
-        videos = 0
-        for path in self._paths:
-            try:
-                reader = VideoReader(path)
-            except InputError:
-                continue
-            show = partial(self._show, path)
+        videos, left = 0, [path for path in self.paths if self.changing(path)]
+        while left and videos < _LEAST_VIDEOS <= videos + len(left):
+            path = left.pop(0)
+            reader = VideoReader(path)
             detector = moving_detector("person" if kind == "person" else "vehicle", "mog2", reader.info.fps)
-            found = detect_moving(reader, "look", detector, show)
-            videos += bool(found.rows)
-            if videos >= _LEAST_VIDEOS:
-                break
+            images, most = self.images(path), self.changing(path)[0]
+            self._progress(f"{path.name}: {kind}", 0.9)
+            if len(images) > 4:
+                detector.initialise(images)
+            middle = (most + 0.5) / len(images) * reader.info.frames / reader.info.fps
+            shown: Collected = {}
+            run_detector(_Part(path, middle - 0.5 * _LOOK_S, middle + 0.5 * _LOOK_S), "look", detector, collected=shown)
+            names = confirmed_labels(shown, detector)
+            videos += sum(any(one.label in names for one in seen) for _, seen in shown.values()) >= _LEAST_SEEN
         return videos
+
+
+class _Part(VideoReader):
+    """The frames of a video from one time [s] to another, at least of its beginning."""
+
+    def __init__(self, path: Path, begin: float, end: float) -> None:
+        super().__init__(path)
+        length = self.info.frames / self.info.fps
+        self._begin = max(min(begin, length - (end - begin)), 0.0)
+        self._end = self._begin + end - begin
+
+    def __iter__(self) -> Iterator[VideoFrame]:
+        for frame in super().__iter__():
+            if frame.time > self._end:
+                return
+            if frame.time >= self._begin:
+                yield frame
 
 
 def _steady_tags(
@@ -289,6 +339,18 @@ def _smallest(name: str, largest: int) -> str:
     if not name.endswith("_1000"):
         return name
     return next(f"{name[:3]}_{size}" for size in (50, 100, 250, 1000) if largest < size)
+
+
+def _cells(grey: Grey) -> npt.NDArray[np.float32]:
+    """Mean grey levels of cells of ``_CELL`` px."""
+    size = max(grey.shape[1] // _CELL, 1), max(grey.shape[0] // _CELL, 1)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _is_in(changed: Grey, u: float, v: float) -> bool:
+    """Whether a place [px] lies in a cell that changed, or beside one."""
+    row, column = int(v // _CELL), int(u // _CELL)
+    return bool(changed[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].any())
 
 
 def _grey(image: Image) -> Grey:

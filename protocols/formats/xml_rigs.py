@@ -25,8 +25,8 @@ from protocols.geometry.types import Floats
 
 FORMATS = ("qualisys", "vicon", "optitrack")
 _MAX_FILE = 1 << 24  # bytes: of a thousand cameras
-_QUALISYS_UNIT = 64.0  # of a pixel: Qualisys counts in 64ths
-_FROM_Y_UP = np.diag([1.0, -1.0, -1.0])  # the axes of a camera that looks along -z with y up, to OpenCV's
+QUALISYS_UNIT = 64.0  # of a pixel: Qualisys counts in 64ths
+FROM_Y_UP = np.diag([1.0, -1.0, -1.0])  # the axes of a camera that looks along -z with y up, to OpenCV's
 
 
 def detect_format(file: Path) -> str | None:
@@ -76,14 +76,14 @@ def _qualisys(root: ElementTree.Element, file: Path) -> Iterator[tuple[str, bool
         view, lens, place = (_child(tag, key, file, name) for key in ("fov_video", "intrinsic", "transform"))
         left, top, right, bottom = _numbers(view, ("left", "top", "right", "bottom"), file, name)
         keys = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
-        fu, fv, cu, cv = _numbers(lens, keys, file, name) / _QUALISYS_UNIT
+        fu, fv, cu, cv = _numbers(lens, keys, file, name) / QUALISYS_UNIT
         bent = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
-        distortions = np.r_[_numbers(lens, bent, file, name) / _QUALISYS_UNIT, 0.0]
+        distortions = np.r_[_numbers(lens, bent, file, name) / QUALISYS_UNIT, 0.0]
         intrinsics = _intrinsics(right - left + 1, bottom - top + 1, (fu, fv, cu - left, cv - top), distortions, file)
         centre = _numbers(place, ("x", "y", "z"), file, name)
         cells = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
         rotation = so3.nearest(_numbers(place, cells, file, name).reshape(3, 3))
-        pose = Pose(_FROM_Y_UP @ rotation, centre)
+        pose = Pose(FROM_Y_UP @ rotation, centre)
         model = tag.get("model", "").lower()
         yield name, "video" in model or "none" in model or not model, ForeignCamera(name, intrinsics, pose)
 
@@ -122,7 +122,7 @@ def _optitrack(root: ElementTree.Element, file: Path) -> Iterator[tuple[str, boo
         distortions = _numbers(lens, ("k1", "k2", "TangentialX", "TangentialY", "k3"), file, name)
         intrinsics = _intrinsics(width, height, (fu, fv, cu, cv), distortions, file)
         turn = so3.nearest(_numbers(place, [f"OrientMatrix{i}" for i in range(9)], file, name).reshape(3, 3))
-        pose = Pose(_FROM_Y_UP @ turn.T, _numbers(place, ("X", "Y", "Z"), file, name))
+        pose = Pose(FROM_Y_UP @ turn.T, _numbers(place, ("X", "Y", "Z"), file, name))
         yield name, True, ForeignCamera(name, intrinsics, pose)
 
 

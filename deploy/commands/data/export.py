@@ -23,6 +23,9 @@ def export(
         "colmap",
         "ros",
         "opensfm",
+        "qualisys",
+        "vicon",
+        "optitrack",
         "trc",
         "c3d",
         "session",
@@ -37,7 +40,8 @@ def export(
 
     aniposelib, caliscope, pose2sim, freemocap: one TOML file in the units that the tool expects. kalibr: a camchain
     YAML with timeshift_cam_imu. opencv: one CAMERA.yml per camera for cv2.FileStorage. colmap: cameras.txt, images.txt,
-    points3D.txt. ros: one camera_info CAMERA.yaml per camera. opensfm: one reconstruction.json. trc, c3d: a trajectory
+    points3D.txt. ros: one camera_info CAMERA.yaml per camera. opensfm: one reconstruction.json. qualisys,
+    vicon, optitrack: one XML file (.qca.txt, .xcp, .mcal). trc, c3d: a trajectory
     for OpenSim and motion capture, in the world frame, with gaps marked. session: rig.toml and observations.csv of
     a log.
     Information that a format cannot represent is listed in a warning.
@@ -66,7 +70,8 @@ def export(
     log = is_log(source)
     if to is None and not log:
         remedy = (
-            "give --to aniposelib, caliscope, pose2sim, freemocap, opencv, kalibr, colmap, ros, opensfm, trc or c3d"
+            "give --to aniposelib, caliscope, pose2sim, freemocap, opencv, kalibr, colmap, ros, opensfm, qualisys, "
+            "vicon, optitrack, trc or c3d"
         )
         raise InputError("--to is missing", file=source, remedy=remedy)
     if log and to not in (None, "session"):

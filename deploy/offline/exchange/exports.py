@@ -6,7 +6,7 @@ from pathlib import Path
 
 from protocols.core.errors import InputError
 from protocols.core.files import file_in
-from protocols.formats import colmap, opensfm, ros, toml_rigs, trc, yaml_rigs
+from protocols.formats import colmap, opensfm, ros, toml_rigs, trc, xml_export, yaml_rigs
 from protocols.formats.c3d import write_c3d
 from protocols.formats.cameras import ExportedFiles, convert_units
 from protocols.session.calibration import read_calibration
@@ -34,6 +34,8 @@ def calibration_files(source: Path, to: str, out: Path) -> tuple[dict[Path, str]
         written = ros.write(cameras)
     elif to == "opensfm":
         written = opensfm.write(cameras, out.name)
+    elif to in xml_export.UNITS:
+        written = xml_export.write(to, cameras, rig.units, scale, out.name)
     else:
         written = colmap.write(cameras)
     folder = out if to in IN_FOLDERS else out.parent

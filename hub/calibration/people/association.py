@@ -42,7 +42,7 @@ _PAUSE_S, _TAIL = 1.0, 5  # s that a person may be lost or confused in one camer
 _STEP_STD, _DRIFT_STD = 0.03, 0.3  # of a person's size, and per second of the pause
 _MAX_CONTINUITY = 3.0  # log-likelihood ratio: people who meet may also turn back
 _MIN_SCORE = 4.0  # log-likelihood ratio from which two tracklets are one person: odds of 50
-_CONSISTENT = 0.95  # share of the seconds in which equal names fit: the given names are kept
+_CONSISTENT = 0.95  # share of the seconds of one person in two cameras with one name: the given names are kept
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -287,15 +287,13 @@ def _renamed(
             score, seconds = _score(one, other, geometry)
             i, j = number[id(one)], number[id(other)]
             scores[i, j] = scores[j, i] = score
-            if set(one.tracklet.names) == set(other.tracklet.names) and len(set(one.tracklet.names)) == 1:
-                consistent, total = consistent + seconds * (score > 0.0), total + seconds
+            if score >= _MIN_SCORE:
+                same = len({*one.tracklet.names, *other.tracklet.names}) == 1
+                consistent, total = consistent + seconds * same, total + seconds
     for mine in views.values():
         index = [number[id(view)] for view in mine]
         scores[np.ix_(index, index)] += _continuity([view.tracklet for view in mine])
-    every = sum(float(np.ptp(view.tracklet.time)) for view in nodes)
-    if total > 0.0 and total > 0.1 * every and consistent >= _CONSISTENT * total:
-        return _with_bars(rig, people), observations, ""
-    if not geometries:
+    if consistent >= _CONSISTENT * total:  # also where nothing could be compared
         return _with_bars(rig, people), observations, ""
     groups = _merge(scores, _conflicts(nodes))
     groups = [group for group in groups if len({nodes[k].tracklet.camera for k in group}) > 1]

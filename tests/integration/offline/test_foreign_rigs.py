@@ -120,6 +120,39 @@ def test_an_export_comes_back_as_it_was(tmp_path: Path, to: str, target: str, po
         assert camera.position == pytest.approx(CENTRE / 1000)
 
 
+@pytest.mark.parametrize(
+    ("to", "target", "held"),
+    [("qualisys", "rig.qca.txt", 4), ("vicon", "rig.xcp", 2), ("optitrack", "calibration.mcal", 5)],
+)
+def test_an_xml_calibration_comes_back_as_it_was(tmp_path: Path, to: str, target: str, held: int) -> None:
+    values = np.array([-0.2, 0.1, 1e-3, -5e-4, 0.02])
+    matrix = np.array([[900.0, 0, 630], [0, 905.0, 350], [0, 0, 1]])
+    lens = Intrinsics(1280, 720, matrix, np.where(np.arange(5) < held, values, 0.0))
+    pose = Pose(ROTATION, CENTRE / 1000)
+    source = calibration_file(tmp_path / "calibration.toml", {"GoPro 2": (lens, pose)})
+    assert run(["export", str(source), "--to", to, "--out", str(tmp_path / target)]) == 0
+    # Pose2Sim's readers of both need a residual. (Its 0.10.49 reads lens and pose of these files to rounding.)
+    needed = {"qualisys": "avg-residual=", "vicon": "WORLD_ERROR="}.get(to, "")
+    assert needed in (tmp_path / target).read_text()
+    out = tmp_path / "again.toml"
+    assert run(["import", str(tmp_path / target), "--out", str(out)]) == 0
+    rig, cameras = read_calibration(out)
+    camera = cameras["GoPro 2"]
+    assert camera.intrinsics.matrix == pytest.approx(lens.matrix)
+    assert camera.intrinsics.distortions == pytest.approx(lens.distortions)
+    assert camera.pose.rotation == pytest.approx(pose.rotation)
+    assert camera.pose.position * (0.001 if rig.units == "mm" else 1.0) == pytest.approx(pose.position)
+
+
+def test_vicon_refuses_a_lens_that_it_cannot_hold(tmp_path: Path, capsys: Capture) -> None:
+    matrix = np.array([[900.0, 0, 630], [0, 905.0, 350], [0, 0, 1]])
+    lens = Intrinsics(1280, 720, matrix, np.array([-0.2, 0.1, 0.01, 0.0, 0.0]))
+    source = calibration_file(tmp_path / "calibration.toml", {"a": (lens, Pose(ROTATION, CENTRE / 1000))})
+    assert run(["export", str(source), "--to", "vicon", "--out", str(tmp_path / "rig.xcp")]) == 3
+    assert "tangential" in capsys.readouterr().err
+    assert not (tmp_path / "rig.xcp").exists()
+
+
 def test_caliscopes_table_of_today_is_read(tmp_path: Path) -> None:
     file = tmp_path / "xy.csv"
     file.write_text(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -15,45 +14,31 @@ from protocols.geometry.pose import fit_similarity
 from protocols.session.calibration import read_calibration
 from protocols.session.folder import write_observations
 from protocols.session.observations import Observations
-from tests.support.walking_people import JOINTS, THIGH, PeopleWorld, people_world
+from tests.bench.several_people import named
+from tests.support.walking_people import THIGH, people_world
 
 Capture = pytest.CaptureFixture[str]
 SECONDS = 12.0
 FEW = {"nose", "left_hip", "right_hip", "left_knee", "right_knee", "left_wrist", "right_wrist"}
 
 
-def seen_people(world: PeopleWorld, observations: Observations) -> dict[str, Counter[int]]:
-    """How often each name is which true person, by the place of the nose."""
-    nose = JOINTS.index("nose")
-    found: dict[str, Counter[int]] = {}
-    for (camera, label), track in observations.tracks.items():
-        person, _, joint = label.partition(".")
-        if joint == "nose":
-            one = world.cameras[camera]
-            for time, pixel in zip(track.time[::10].tolist(), track.pixels[::10], strict=True):
-                noses = world.people(time * one.rate + one.offset)[:, nose]
-                distance = np.linalg.norm(one.lens.project(one.pose.camera_from_world(noses)) - pixel, axis=1)
-                found.setdefault(person, Counter())[int(distance.argmin())] += 1
-    return found
-
-
 def test_people_get_one_name_in_all_cameras_whatever_each_camera_called_them() -> None:
     world = people_world(12, 3, (12.0, 15.0, 12.0))
     given = world.observations(SECONDS, seed=12)
-    mixed = seen_people(world, given)
+    mixed = named(world, given)
     assert all(max(who.values()) < 0.8 * who.total() for who in mixed.values())  # by the cameras' own numbers
-    _, named, note = associate_people(world.rig(), given)
-    found = seen_people(world, named)
+    _, seen, note = associate_people(world.rig(), given)
+    found = named(world, seen)
     assert "people were associated" in note
     assert sum(max(who.values()) for who in found.values()) > 0.98 * sum(who.total() for who in found.values())
-    assert len(named) > 0.9 * len(given)
+    assert len(seen) > 0.9 * len(given)
 
 
 def test_names_that_agree_are_kept() -> None:
     world = people_world(13, 2, (12.0, 15.0))
-    _, named, _ = associate_people(world.rig(), world.observations(SECONDS, seed=13))
-    rig, again, note = associate_people(world.rig(), named)
-    assert again is named
+    _, first, _ = associate_people(world.rig(), world.observations(SECONDS, seed=13))
+    rig, again, note = associate_people(world.rig(), first)
+    assert again is first
     assert (rig.scale_bars, note) == ((), "")
 
 

@@ -166,6 +166,19 @@ def test_no_marker_in_any_video_is_refused_with_a_result(tmp_path: Path, capsys:
     assert json.loads((tmp_path / "out" / "result.json").read_text())["status"] == "refused"
 
 
+def test_videos_in_which_nothing_changes_are_refused_whatever_colours_they_show(
+    tmp_path: Path, capsys: Capture
+) -> None:
+    (tmp_path / "videos").mkdir()
+    rng = np.random.default_rng(2)
+    for name in ("a", "b"):
+        scene = np.kron(rng.integers(0, 255, (6, 8, 3)), np.ones((20, 20, 1)))
+        images = [np.clip(scene + rng.normal(0.0, 3.0, scene.shape), 0, 255).astype(np.uint8) for _ in range(20)]
+        write_video(tmp_path / "videos" / f"{name}.mp4", images, np.arange(20) / 20)
+    assert run(["calibrate", str(tmp_path / "videos"), "--out", str(tmp_path / "out")]) == 3
+    assert "tried: what changes between some frames" in capsys.readouterr().err
+
+
 def test_detections_of_a_video_carry_its_frame_times_and_lie_on_the_ball(
     recorded: RecordedVideos, tmp_path: Path
 ) -> None:

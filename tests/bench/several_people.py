@@ -1,0 +1,92 @@
+"""Cameras calibrated by the keypoints of several walking people, whom every camera numbers in its own, changing way.
+
+    python -m tests.bench.several_people [--seeds 1 2] [--people 3] [--fps 25 30 25] [--seconds 30] [--no-lenses]
+
+Keypoints have 2 px of noise and gaps, and a camera numbers people anew every 5 s. Printed: the share of the keypoints
+whose name is one person in all cameras, and the errors of the calibration from them after one similarity.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+
+import numpy as np
+
+from hub.calibration.people.association import associate_people
+from hub.calibration.pipeline import calibrate
+from protocols.core.errors import Refused
+from protocols.geometry import so3
+from protocols.geometry.pose import fit_similarity
+from protocols.session.observations import Observations
+from protocols.session.rig import Rig
+from tests.support.walking_people import JOINTS, PeopleWorld, people_world
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--people", type=int, default=3)
+    parser.add_argument("--fps", type=float, nargs="+", default=[25.0, 30.0, 25.0])
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--no-lenses", action="store_true")
+    options = parser.parse_args()
+    for seed in options.seeds:
+        world = people_world(seed, options.people, tuple(options.fps))
+        given = world.observations(options.seconds, seed=seed)
+        began = time.process_time()
+        rig, seen, _ = associate_people(world.rig(not options.no_lenses), given)
+        spent = time.process_time() - began
+        right = sum(max(who.values()) for who in named(world, seen).values())
+        total = sum(who.total() for who in named(world, seen).values())
+        print(
+            f"seed {seed}: {100 * right / total:.1f} % named rightly, {100 * len(seen) / len(given):.0f} % of the rows,"
+        )
+        try:
+            print(f"  {scored(world, options.seconds, rig, seen)}; association {spent:.0f} s of CPU", flush=True)
+        except Refused as refused:
+            print(f"  refused: {refused.reason}", flush=True)
+    return 0
+
+
+def named(world: PeopleWorld, observations: Observations) -> dict[str, Counter[int]]:
+    """How often each name is which true person, by the place of the nose."""
+    nose = JOINTS.index("nose")
+    found: dict[str, Counter[int]] = {}
+    for (camera, label), track in observations.tracks.items():
+        person, _, joint = label.partition(".")
+        if joint == "nose":
+            one = world.cameras[camera]
+            for stamp, pixel in zip(track.time[::10].tolist(), track.pixels[::10], strict=True):
+                noses = world.people(stamp * one.rate + one.offset)[:, nose]
+                distance = np.linalg.norm(one.lens.project(one.pose.camera_from_world(noses)) - pixel, axis=1)
+                found.setdefault(person, Counter())[int(distance.argmin())] += 1
+    return found
+
+
+def scored(world: PeopleWorld, seconds: float, rig: Rig, seen: Observations) -> str:
+    """The errors of the calibration."""
+    began = time.process_time()
+    found = calibrate(rig, seen, thorough=True).cameras
+    spent = time.process_time() - began
+    places, true = (np.array([one[name].pose.position for name in found]) for one in (found, world.cameras))
+    fit = fit_similarity(places, true)
+    turns = [
+        np.degrees(so3.angle_between(fit.pose(one.pose).rotation, world.cameras[name].pose.rotation))
+        for name, one in found.items()
+    ]
+    middle, off = 0.5 * seconds, []
+    for name, one in found.items():
+        real = world.cameras[name]
+        clock = one.time_map
+        off.append(clock.clock_rate * middle + clock.time_offset - real.rate * middle - real.offset)
+    worst = 100 * float(np.linalg.norm(fit.points(places) - true, axis=1).max())
+    return (
+        f"{len(found)} of {len(world.cameras)} cameras, {worst:.1f} cm, {max(turns):.2f}°, "
+        f"lags {1e3 * np.ptp(off):.1f} ms, {spent:.0f} s of CPU"
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
