@@ -60,6 +60,7 @@ BENCHES = {
     "broken_cameras": Bench("what one broken camera costs", ("--seeds", "1")),
     "poses": Bench("distributed poses against the joint optimum", ("--quick", "--rows", "section4,bearings")),
     "crowd": Bench("a crowd before seven cameras, boxes spoilt", ("--seeds", "2"), data=True),
+    "hall": Bench("a simulated hall, offline and live", ("--people", "12", "--seconds", "6")),
     "logs": Bench("logs: rates, kill -9, damage", ("--quick",)),
     "view": Bench("help, first calibration, first paint, what watching costs", ("--quick",)),
     "people_detector": Bench("people before one camera, beside MOG2 alone", ("--seeds", "1", "--seconds", "20")),
