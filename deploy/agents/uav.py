@@ -49,7 +49,8 @@ def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable
 
     from deploy.agents.systemd_notify import HeartbeatDevice
     from deploy.agents.uav_video import OperatorVideo, serve_video
-    from edge.agents.uav import UavAgent, UavSettings
+    from edge.agents.uav import UavAgent
+    from edge.agents.uav_settings import UavSettings
 
     cv2.setNumThreads(1)
     with ExitStack() as stack:
@@ -121,7 +122,8 @@ def make_agent(
     boot_id: str | None = None,
 ) -> object:
     """The agent for a device and a link. settings: a ``UavSettings``; now_ns: the host's monotonic clock."""
-    from edge.agents.uav import UavAgent, UavSettings
+    from edge.agents.uav import UavAgent
+    from edge.agents.uav_settings import UavSettings
     from edge.mavlink.roles.camera import CameraComponent
     from edge.mavlink.roles.guidance import Guidance
     from edge.mavlink.roles.vehicle import Vehicle

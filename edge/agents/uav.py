@@ -8,7 +8,7 @@ import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -17,8 +17,9 @@ from google.protobuf.message import Message
 
 from edge.agents.publish_queue import PublishQueue
 from edge.agents.target_report import status_line, update_tracking_status
-from edge.agents.thumbnails import THUMBNAIL_WIDTH, thumbnail_message
+from edge.agents.thumbnails import thumbnail_message
 from edge.agents.uav_guidance import FRAME_TIMEOUT_S, LINK_STALE_S, GuidanceControl
+from edge.agents.uav_settings import UavSettings
 from edge.detectors.base import Detector
 from edge.devices.base import Device, Frame, Image
 from edge.mavlink.link.connection import Link, ReceivedMessage
@@ -33,8 +34,6 @@ from protocols.bus.base import Bus
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.version import VERSION
 from protocols.geometry import so3
-from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import (
     FLIGHT_IMAGE,
@@ -59,26 +58,6 @@ TOPICS = {
     topic.message: topic
     for topic in (FLIGHT_IMAGE, TELEMETRY, TARGET_COMMAND, TARGET, TARGET_CLOUD, ROAD_MAP, UAV_INFO, STATUS, PICTURE)
 }
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class UavSettings:
-    """The camera of a UAV agent and the settings of its estimator. lens, body_from_camera: None where not known.
-
-    size: (width, height) [px]. jpeg_quality: of the images published on the bus, which are then also the tracker's
-    input; None: no images are published. pictures_hz, picture_width: rate and width [px] of the thumbnails, which are
-    published only while somebody subscribes; a rate of 0 disables them.
-    """
-
-    size: tuple[int, int]
-    fps: float
-    lens: Intrinsics | None
-    body_from_camera: Floats | None
-    seed: int = 0
-    model: str = "ground"
-    jpeg_quality: int | None = None
-    pictures_hz: float = 2.0
-    picture_width: int = THUMBNAIL_WIDTH
 
 
 class UavAgent:

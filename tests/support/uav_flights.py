@@ -18,7 +18,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from deploy.agents.uav import gimbal_from_camera, make_agent
 from deploy.config.uav import SimulatedFlightConfig, UavConfig
-from edge.agents.uav import UavAgent, UavSettings
+from edge.agents.uav import UavAgent
+from edge.agents.uav_settings import UavSettings
 from edge.devices.base import Frame
 from edge.devices.simulated.aircraft import Disturbance, SimulatedAircraft
 from edge.devices.simulated.aircraft_camera import FlightCamera

@@ -18,11 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.moving.bootstrap import BackgroundBootstrap, background_mode
+from edge.detectors.moving.ghosts import GHOST_STEP, Box, Image, remove_ghosts, slices, uncovered_background
 from edge.detectors.moving.shadows import ShadowDetector
 from protocols.geometry.types import Bools, Floats
 
-Image = npt.NDArray[np.uint8]
-Box = tuple[float, float, float, float]
 SubtractorName = Literal["mog2", "knn"]
 
 _UPDATE_S = 0.4  # time between updates of the model
@@ -42,15 +41,8 @@ _SUBSAMPLE = 8  # px: a gain of the exposure is the same everywhere
 _GAIN = (0.3, 3.3)  # of the exposure between two images; beyond, it is another scene
 _UNIFORM_GAIN = 0.08  # deviation of a gain from 1 above which it varies over the image
 _NOISE_STEP = 11  # 8-bit steps, times the gain, which amplifies the noise of a dim image
-_GHOST_STEP = 22  # 8-bit steps
-# over the height: distance from a rim that is compared; smallest number of its pixels
-_RIM_REACH_SHARE, _MIN_RIM_PIXELS = 0.04, 10
 # time after the start in which ghosts of the first objects are searched; time without change
 _INITIAL_GHOSTS_S, _STILL_S = 16.0, 0.4
-# window over the image height; reach of a rim [px]; contrast ratio, as _GHOST_RATIO
-_VOTE_WINDOW, _RIM_REACH, _UNCOVERED_RATIO = 0.12, 7, 1.6
-# factor between the contrasts of background and image; smallest contrast of the background [8-bit steps]
-_GHOST_RATIO, _MIN_GHOST_CONTRAST = 1.4, 12.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,7 +210,7 @@ class BackgroundSubtractor:
         if self._age - self._recent[0][0] < _STILL_S or self._age - self._ghosts_checked_at < 0.5 * _STILL_S:
             return foreground
         self._ghosts_checked_at = self._age
-        still = cv2.inRange(cv2.absdiff(compensated, self._recent[0][1]), (0, 0, 0), (_GHOST_STEP,) * 3)
+        still = cv2.inRange(cv2.absdiff(compensated, self._recent[0][1]), (0, 0, 0), (GHOST_STEP,) * 3)
         places = cv2.bitwise_and(uncovered_background(compensated, self._background, foreground), foreground)
         left = np.asarray(cv2.bitwise_and(places, still), dtype=np.uint8)
         if not cv2.countNonZero(left):
@@ -233,7 +225,7 @@ class BackgroundSubtractor:
 
     def absorb_ghost(self, image: Image, box: Box) -> None:
         """Treat the content of a box as background from now on: it is a ghost."""
-        rows, columns = _slices(box, image.shape)
+        rows, columns = slices(box, image.shape)
         if self._ghost_image is None or self._ghost_mask is None:
             self._ghost_image, self._ghost_mask = image.copy(), np.zeros(image.shape[:2], np.uint8)
         self._ghost_image[rows, columns] = self._compensate_gain(image)[rows, columns]
@@ -312,7 +304,7 @@ class BackgroundSubtractor:
         if protected and not learning:
             update_image = compensated.copy()
             for box in protected:
-                rows, columns = _slices(box, compensated.shape)
+                rows, columns = slices(box, compensated.shape)
                 update_image[rows, columns] = self._background[rows, columns]
         rate = max(1.0 / self._frames, 0.02) if learning else self._frames_since_update * self._period / _MEMORY_S
         self._model.apply(update_image, learningRate=min(rate, 0.5))
@@ -322,13 +314,6 @@ class BackgroundSubtractor:
         self._background = np.asarray(cv2.convertScaleAbs(self._background_mean), dtype=np.uint8)
         self._background_range = None
         self._frames_since_update = 0
-
-
-def remove_ghosts(foreground: Image, now: Image, then: Image, where: Image) -> Image:
-    """A mask (H, W) 0/255 with 0 wherever ``where`` is 255 and two images (H, W, 3) are equal within noise."""
-    step = _GHOST_STEP - 1
-    like = cv2.inRange(cv2.absdiff(now, then), (0, 0, 0), (step, step, step))
-    return np.asarray(cv2.bitwise_and(foreground, cv2.bitwise_not(cv2.bitwise_and(like, where))), dtype=np.uint8)
 
 
 def _gain_field(usable: Bools, left: Floats, size: tuple[int, int]) -> npt.NDArray[np.float32]:
@@ -350,71 +335,3 @@ def _gain_field(usable: Bools, left: Floats, size: tuple[int, int]) -> npt.NDArr
     v = (2.0 * np.arange(size[1]) / size[1] - 1.0)[:, None]
     log_gain = found[0] + found[1] * u + found[2] * v + found[3] * u * u + found[4] * u * v + found[5] * v * v
     return np.asarray(np.exp(log_gain), dtype=np.float32)
-
-
-def _slices(box: Box, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    x, y, w, h = box
-    left, top = max(math.floor(x), 0), max(math.floor(y), 0)
-    return slice(top, min(math.ceil(y + h), shape[0])), slice(left, min(math.ceil(x + w), shape[1]))
-
-
-def is_ghost(image: Image, background: Image, box: Box, foreground: Image) -> bool:
-    """Whether a silhouette is a ghost: its rim has a higher contrast in the background than in the image.
-
-    A ghost is the former place of an object that was learnt as background and has left.
-    """
-    x, y, w, h = box
-    reach = 2 * int(np.clip(round(_RIM_REACH_SHARE * h), 2, 15)) + 1
-    rows, columns = _slices((x - reach, y - reach, w + 2 * reach, h + 2 * reach), image.shape)
-    mask = foreground[rows, columns]
-    if mask.size == 0:
-        return False
-    rim = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
-    # Exclude the rims of other silhouettes.
-    inner = np.zeros(mask.shape, dtype=np.bool_)
-    top, left = max(math.floor(y), 0) - rows.start, max(math.floor(x), 0) - columns.start
-    inner[top : top + math.ceil(h) + 1, left : left + math.ceil(w) + 1] = True
-    rim &= inner
-    if rim.sum() < _MIN_RIM_PIXELS:
-        return False
-    before, now = (_rim_contrast(one[rows, columns], mask, reach)[rim] for one in (background, image))
-    return bool(np.median(before) > _GHOST_RATIO * np.median(now) and np.median(before) > _MIN_GHOST_CONTRAST)
-
-
-def uncovered_background(image: Image, background: Image, foreground: Image) -> Image:
-    """Where (H, W) 0/255 a mask shows ghosts: objects of the background image that are not in this one.
-
-    As ``is_ghost``, of every part by the rims near it. At half the resolution.
-    """
-    found = np.zeros_like(foreground)
-    x, y, w, h = cv2.boundingRect(foreground)
-    if w < _RIM_REACH or h < _RIM_REACH:
-        return found
-    wide = (2 * max(round(_VOTE_WINDOW * foreground.shape[0] / 4), 2) + 1,) * 2
-    rows, columns = _slices((x - _RIM_REACH, y - _RIM_REACH, w + 2 * _RIM_REACH, h + 2 * _RIM_REACH), foreground.shape)
-    foreground, image, background = foreground[rows, columns], image[rows, columns], background[rows, columns]
-    height, width = foreground.shape
-    size = (width + 1) // 2, (height + 1) // 2
-    mask = np.asarray(cv2.medianBlur(cv2.resize(foreground, size, interpolation=cv2.INTER_NEAREST), 5), dtype=np.uint8)
-    rim = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)).astype(np.float32) / 255.0
-    smaller = (
-        np.asarray(cv2.resize(one, size, interpolation=cv2.INTER_AREA), dtype=np.uint8) for one in (background, image)
-    )
-    before, now = (cv2.boxFilter(rim * _rim_contrast(one, mask, _RIM_REACH), -1, wide) for one in smaller)
-    plain = _MIN_GHOST_CONTRAST * cv2.boxFilter(rim, -1, wide)
-    left = np.where((before > _UNCOVERED_RATIO * now) & (before > plain), mask, 0).astype(np.uint8)
-    found[rows, columns] = cv2.resize(left, (width, height), interpolation=cv2.INTER_NEAREST)
-    return found
-
-
-def _rim_contrast(part: Image, mask: Image, reach: int) -> npt.NDArray[np.float32]:
-    """Difference (h, w) of the mean colours (h, w, 3) near each pixel inside and outside a mask (h, w) 0/255."""
-    size = (reach, reach)
-
-    def mean(where: Image) -> npt.NDArray[np.float32]:
-        total = cv2.boxFilter(cv2.bitwise_and(part, part, mask=where), cv2.CV_32F, size, normalize=False)
-        count = cv2.boxFilter(where, cv2.CV_32F, size, normalize=False) / np.float32(255.0)
-        return np.asarray(cv2.divide(total, cv2.merge([np.maximum(count, np.float32(1.0))] * 3)), dtype=np.float32)
-
-    blue, green, red = cv2.split(cv2.absdiff(mean(mask), mean(np.asarray(cv2.bitwise_not(mask), dtype=np.uint8))))
-    return np.asarray(cv2.max(cv2.max(blue, green), red), dtype=np.float32)

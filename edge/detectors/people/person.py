@@ -19,7 +19,8 @@ import numpy.typing as npt
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.moving.association import match_predictions
 from edge.detectors.moving.camera_motion import CameraTravel
-from edge.detectors.moving.foreground import BackgroundSubtractor, ForegroundMasks, SubtractorName, is_ghost
+from edge.detectors.moving.foreground import BackgroundSubtractor, ForegroundMasks, SubtractorName
+from edge.detectors.moving.ghosts import is_ghost
 from edge.detectors.moving.tracklets import ImageTracklet, ShortTermTracker
 from edge.detectors.people.height_model import HeightModel
 from edge.detectors.people.segmentation import segment_people

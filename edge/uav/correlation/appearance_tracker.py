@@ -28,6 +28,7 @@ _LEARN_INSIDE = 0.97  # share of the box in the image above which appearance, si
 _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
+_UNKNOWN_STEP = 0.1  # std of a step of the scene that could not be measured, over the image's width
 _MOVES = 0.3  # speed over the scene at which a heading is given, in target lengths a second
 _LOST_STD, _LOST_AFTER_S = 8.0, 15.0  # in target lengths; as of the ground tracker
 _MAX_GROWTH = 8.0  # of a side since the first frame
@@ -148,6 +149,8 @@ class AppearanceTracker:
             if self._missed == 0:
                 box = box.sized(box.sides * motion.zoom).turned(turn)
             self._redetection.move(motion, self._scene.reach, dt)
+        elif self._missed:
+            self._motion_filter.lose_scene(_UNKNOWN_STEP * self._size[0])
         if self._missed:
             self._broken |= not motion.trusted
             angle = self._turn_rate * dt

@@ -18,7 +18,7 @@ from protocols.geometry.types import Floats
 
 _MARGIN = 1.0  # log odds by which a place must exceed the next best one, and the one under test
 _ANYWHERE_RATE = 0.01  # at which a target is not near its prediction any more [1/s]
-_PROPOSED = -3.0  # log prior of a place that another tracker has found
+_PROPOSED = -2.0  # log prior of a place that another tracker has found
 _PROMISING = 0.0  # log odds of a place under test above which others are searched in every second frame only
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
 _MOST_TESTED = 2

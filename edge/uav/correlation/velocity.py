@@ -39,6 +39,10 @@ class VelocityFilter:
         self.velocity, self._lag = linear @ self.velocity, linear @ self._lag
         self._covariance = self._covariance * abs(float(np.linalg.det(linear)))
 
+    def lose_scene(self, std: float) -> None:
+        """The motion of the scene is unknown in one frame: std of it, one coordinate [px]."""
+        self._covariance[0, 0] += std**2
+
     def turn(self, angle: float) -> None:
         """Turn the velocity by ``angle`` [rad]."""
         c, s = np.cos(angle), np.sin(angle)

@@ -6,7 +6,7 @@ import numpy as np
 
 from edge.uav.ground.road_map import RoadMap
 from edge.uav.prediction import particle_filter as pf
-from edge.uav.prediction import particle_set
+from edge.uav.prediction import particle_set, path_assignment
 from edge.uav.prediction.driver_model import DriverModel
 from edge.uav.prediction.particle_set import ParticleSet
 from edge.uav.prediction.paths import RoadPath, road_edges, trace_paths
@@ -70,7 +70,7 @@ class OcclusionPredictor:
             )
         if not self.paths:
             return particles
-        particles = particle_set.assign_paths(particles, self.paths, _ON_PATH_SHARE, rng)
+        particles = path_assignment.assign_paths(particles, self.paths, _ON_PATH_SHARE, rng)
         is_braking = fit is not None and fit.longitudinal_acceleration < _BRAKING_ACCELERATION
         return particles if is_braking else particle_set.raise_lateral_limits(particles, self.paths[:1])
 
@@ -80,7 +80,7 @@ class OcclusionPredictor:
         if self._frames % _RETRACE_EVERY or not self.paths:
             return particles
         paths = self._trace_paths(road, time)
-        particles = particle_set.reassign_paths(particles, self.paths, paths, rng)
+        particles = path_assignment.reassign_paths(particles, self.paths, paths, rng)
         self.paths = paths
         return particles
 

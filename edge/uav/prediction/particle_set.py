@@ -22,7 +22,6 @@ _MAX_LATERAL_LIMIT = 6.0  # friction limit of tyres [units/s²]
 _CRUISE_TIME_CONSTANT_S = 2.5  # of the return to the cruise speed
 _MAX_CRUISE_ACCELERATION = 2.0  # of that return [units/s²]
 _MAX_SPEED = 60.0
-_UNKNOWN_CURVATURE_STD = 0.008  # of road that was not observed [1/unit]
 _VELOCITY_STD_LIMITS = (0.7, 3.0)  # of a particle set's velocity [units/s]
 _ACCELERATION_PERSISTENCE = 0.35  # share of the acceleration at the last detection that persists
 _MIN_SIGNIFICANCE = 1.5  # of an acceleration, in stds
@@ -240,26 +239,6 @@ def propagate(
     )
 
 
-def assign_paths(particles: ParticleSet, paths: list[RoadPath], share: float, rng: np.random.Generator) -> ParticleSet:
-    """Put a share of the particles on paths that start at their position, in proportion to the path weights."""
-    n = len(particles)
-    start, heading = paths[0].points[0], paths[0].headings[0]
-    local = particles.position - start
-    arc_length = local @ np.array([np.cos(heading), np.sin(heading)])
-    lateral_offset = local @ np.array([-np.sin(heading), np.cos(heading)])
-    edges = np.cumsum([path.weight for path in paths])
-    drawn_path = np.minimum(np.searchsorted(edges, rng.random(n)), len(paths) - 1)
-    free = rng.random(n) >= share
-    curvature = np.where(free, particles.curvature, rng.normal(0.0, _UNKNOWN_CURVATURE_STD, n))
-    return replace(
-        particles,
-        path=np.where(free, NO_PATH, drawn_path),
-        arc_length=arc_length,
-        lateral_offset=lateral_offset,
-        curvature=curvature,
-    )
-
-
 def raise_lateral_limits(particles: ParticleSet, paths: list[RoadPath]) -> ParticleSet:
     """Particles of a driver who does not brake: the lateral limit is raised where it would demand braking."""
     lateral_limit = particles.lateral_limit.copy()
@@ -276,33 +255,6 @@ def raise_lateral_limits(particles: ParticleSet, paths: list[RoadPath]) -> Parti
 def _braking_allowance(distance: float) -> float:
     """Possible decrease of the squared speed over a distance [units²/s²]."""
     return 2.0 * _BRAKING_DECELERATION * max(distance - _LOOKAHEADS[0], 0.0)
-
-
-def reassign_paths(
-    particles: ParticleSet, old: list[RoadPath], new: list[RoadPath], rng: np.random.Generator
-) -> ParticleSet:
-    """Change to retraced paths from the same start; a new path gets its share of the particles before its branch."""
-    successor = np.full(len(old), 0, dtype=np.int64)
-    claimed = np.zeros(len(new), bool)
-    for k, path in enumerate(old):
-        gaps = []
-        for other in new:
-            m = min(len(path.points), len(other.points))
-            gaps.append(float(np.linalg.norm(path.points[:m] - other.points[:m], axis=1).mean()))
-        successor[k] = int(np.argmin(gaps))
-        claimed[successor[k]] = True
-    assigned = np.where(particles.path == NO_PATH, NO_PATH, successor[np.maximum(particles.path, 0)])
-    for k, other in enumerate(new):
-        if claimed[k] or k == 0:
-            continue
-        base = new[0]
-        m = min(len(base.points), len(other.points))
-        diverged = np.linalg.norm(base.points[:m] - other.points[:m], axis=1) > 2.0
-        branch_length = float(np.argmax(diverged)) * 1.5 if diverged.any() else 0.0
-        eligible = (assigned == 0) & (particles.arc_length < branch_length)
-        switches = eligible & (rng.random(len(particles)) < other.weight / (other.weight + base.weight))
-        assigned = np.where(switches, k, assigned)
-    return replace(particles, path=assigned)
 
 
 def nudge_to_fit(

@@ -17,10 +17,8 @@ from edge.detectors.moving.association import match_predictions
 from edge.detectors.moving.foreground import (
     BackgroundSubtractor,
     background_mode,
-    is_ghost,
-    remove_ghosts,
-    uncovered_background,
 )
+from edge.detectors.moving.ghosts import is_ghost, remove_ghosts, uncovered_background
 from edge.detectors.moving.shadows import ShadowDetector
 from edge.detectors.moving.vehicle import VehicleDetector
 from edge.detectors.people.height_model import HeightModel

@@ -8,7 +8,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from edge.agents.uav import UavAgent, UavSettings
+from edge.agents.uav import UavAgent
+from edge.agents.uav_settings import UavSettings
 from edge.detectors.base import Detection, Detector
 from edge.devices.base import Frame
 from edge.mavlink.link.connection import Link
