@@ -15,6 +15,7 @@ from google.protobuf.message import Message
 from hub.distributed.network.host import ROLE as NODES
 from hub.live.fair_share import FairShare
 from hub.live.live_hub import SILENT_S, LiveHub
+from hub.live.shedding import Shedding
 from protocols.bus.base import Bus, Publisher, Received
 from protocols.bus.commands import CommandSubscription
 from protocols.core.version import VERSION
@@ -128,6 +129,7 @@ class _HubAgent:
         if hub.nodes is not None:
             stack.enter_context(bus.announce(NODES, agent, boot))
         self._shares = FairShare(self._handle, time.monotonic, _MESSAGES_S)
+        self._shedding = Shedding()
         self._began = time.monotonic()
         self._sequence, self._next_status, self._next_rig, self._next_progress = 0, 0.0, 0.0, 0.0
         self._last_action = ""
@@ -149,7 +151,11 @@ class _HubAgent:
         if self._hub.nodes is not None and self._watch is not None:
             for event in self._watch.drain():
                 self._hub.nodes.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
-        self._shares.take(received for subscription in self._subscriptions for received in subscription.drain())
+        received = [one for subscription in self._subscriptions for one in subscription.drain()]
+        self._shares.take(received)
+        now = time.monotonic()
+        if now >= self._began + _BACKLOG_S:
+            self._shedding.see(self._shares.age_s(received, time.time_ns()), now)
 
     def obey(self, export: Callable[[LiveHub], str] | None) -> None:
         """Do what a view has asked for."""
@@ -170,10 +176,16 @@ class _HubAgent:
                     publisher = self._bus.publisher(NODE_STATE, state.camera)
                     self._node_publishers[state.camera] = self._stack.enter_context(closing(publisher))
                 self._node_publishers[state.camera].put(state)
+        if hub.tracking is not None:
+            hub.tracking.predicts = not self._shedding.sheds_predictions
         self._publish(hub.tick(now, final=final))
         if hub.tracking is not None:
-            for track in hub.tracking.smoothed():
-                self._smoothed.put(track)
+            smoothed = hub.tracking.smoothed()
+            if self._shedding.sheds_smoothed:
+                self._shedding.smoothed += len(smoothed)
+            else:
+                for track in smoothed:
+                    self._smoothed.put(track)
 
     def report(self, now: float, rig: Rig | None, *, last: bool) -> None:
         """Publish progress, the rig and the status, each when it is due."""
@@ -195,10 +207,15 @@ class _HubAgent:
         status = status_message(hub, self._agent, self._boot, self._sequence, counters, now)
         if shares.dropped:
             status.counters["dropped_behind"] = shares.dropped.total()
+        if self._shedding.smoothed:
+            status.counters["shed.smoothed"] = self._shedding.smoothed
+        shed = self._shedding.text(now)
+        if shed and status.state == "running":
+            status.state = "degraded"  # a page shows what such a status says
         needs_advice = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
         behind = f"messages wait of {', '.join(shares.behind[:8])}" if shares.behind else ""
         advice = [one.text for one in hub.guidance.advice()] if needs_advice else []
-        texts = (status.message, behind, *advice, self._last_action)
+        texts = (shed, status.message, behind, *advice, self._last_action)
         status.message = "; ".join(text for text in texts if text)[:_MAX_TEXT]
         return status
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
+from statistics import median_high
 
 from protocols.bus.base import Received
 from protocols.messages import syncline_pb2 as pb
@@ -32,6 +33,16 @@ class FairShare:
     def behind(self) -> list[str]:
         """Senders whose messages wait."""
         return sorted(self._waiting)
+
+    def age_s(self, received: Iterable[Received], now_ns: int) -> float:
+        """Age [s] of the oldest message of the median sender, of what has just been taken and of what waits.
+
+        Not of the oldest of all: one who sends too much waits for itself, and costs the others nothing.
+        """
+        oldest = {sender: queue[0].arrival_ns for sender, queue in self._waiting.items()}
+        for one in received:
+            oldest.setdefault(one.agent, one.arrival_ns)
+        return max(0.0, 1e-9 * (now_ns - median_high(oldest.values()))) if oldest else 0.0
 
     def take(self, received: Iterable[Received]) -> None:
         """Pass on what has arrived, and of what waits as much as there is time for."""

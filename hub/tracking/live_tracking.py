@@ -61,6 +61,9 @@ class LiveTracking:
         self._scale = LengthScale()
         self._boot_ids: dict[str, str] = {}
         self._sequence = 0
+        self.predicts = True
+        """Whether predictions are made; those left out are counted as ``shed.predictions``."""
+        self._shed: Counter[str] = Counter()
         self._predictions = 0
         self._next = -float("inf")
         self._published_ns: int | None = None
@@ -75,8 +78,8 @@ class LiveTracking:
 
     @property
     def counters(self) -> Counter[str]:
-        """Frames, and rows of labelled markers, by how they were handled."""
-        return self.tracker.counters + self.markers.counters
+        """Frames, and rows of labelled markers, by how they were handled; predictions that were left out."""
+        return self.tracker.counters + self.markers.counters + self._shed
 
     def calibrate(
         self,
@@ -178,12 +181,12 @@ class LiveTracking:
         out: list[Message] = [track for each in (*states_since, state) for track in self._tracks(each)]
         ahead = state.time_ns + round(self.settings.ahead_s * NANOSECONDS)
         cameras, parameters = self.tracker.cameras, self.tracker.parameters
-        out.append(
-            prediction_message(
-                self.tracker.predicted_at(ahead), ahead, cameras, self._boot_ids, parameters, self._predictions
-            )
-        )
-        self._predictions += 1
+        number, self._predictions = self._predictions, self._predictions + 1
+        if self.predicts:
+            targets = self.tracker.predicted_at(ahead)
+            out.append(prediction_message(targets, ahead, cameras, self._boot_ids, parameters, number))
+        else:
+            self._shed["shed.predictions"] += 1
         return out
 
     def _numbered(self, tracks: list[pb.Track]) -> list[pb.Track]:

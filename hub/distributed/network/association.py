@@ -47,15 +47,15 @@ class Associator:
         pending = self._pending.get(seen.label)
         if pending is None:
             return []
-        out, interpolation_std = [], deque[SharedObservation](maxlen=_PENDING_CAPACITY)
+        out, waiting = [], list[SharedObservation]()
         for other in pending:
             pair, final = _associate(track, other, self.gap)
             if pair is not None:
                 out.append((other.camera, pair))
             elif not final:
-                interpolation_std.append(other)
-        if interpolation_std:
-            self._pending[seen.label] = interpolation_std
+                waiting.append(other)
+        if waiting:
+            self._pending[seen.label] = deque(waiting, maxlen=_PENDING_CAPACITY)
         else:
             del self._pending[seen.label]
         return out

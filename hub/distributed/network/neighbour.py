@@ -9,6 +9,7 @@ from hub.distributed.network.messages import SharedObservation, StateMessage
 
 _REORDER_WINDOW = 256
 """Largest reordering of one camera's messages."""
+_RECEIVED_MASK = (1 << _REORDER_WINDOW) - 1
 
 
 @dataclass(slots=True, eq=False)
@@ -31,9 +32,7 @@ class Neighbour:
             self.boot, self.highest_sequence, self.received_mask = seen.boot, -1, 0
         ahead = seen.sequence - self.highest_sequence
         if ahead > 0:
-            self.received_mask = (
-                ((self.received_mask << ahead) | 1) & ((1 << _REORDER_WINDOW) - 1) if ahead < _REORDER_WINDOW else 1
-            )
+            self.received_mask = ((self.received_mask << ahead) | 1) & _RECEIVED_MASK if ahead < _REORDER_WINDOW else 1
             self.highest_sequence = seen.sequence
             return ""
         if -ahead >= _REORDER_WINDOW:

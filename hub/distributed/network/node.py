@@ -219,9 +219,7 @@ class PoseNode:
 
     def _observation(self, seen: SharedObservation) -> list[Output]:
         if not (
-            math.isfinite(seen.x)
-            and math.isfinite(seen.y)
-            and math.isfinite(seen.time)
+            math.isfinite(seen.x + seen.y + seen.time)
             and 0.0 < seen.std < 1.0
             and 0.0 <= seen.size < 1e3
             and 0.0 <= seen.size_std < 10.0
@@ -232,9 +230,9 @@ class PoseNode:
         if seen.camera == self.camera:
             out: list[Output] = []
             for camera, row in self._associator.add_own(seen):
-                out += self._pair(self._neighbour(camera), row)
+                out += self._pair(self._neighbours.get(camera) or self._neighbour(camera), row)
             return out
-        neighbour = self._neighbour(seen.camera)
+        neighbour = self._neighbours.get(seen.camera) or self._neighbour(seen.camera)
         reason = neighbour.rejection_reason(seen)
         if reason:
             self.refused[reason] += 1
@@ -243,12 +241,10 @@ class PoseNode:
         return [] if pair is None else self._pair(neighbour, pair[1])
 
     def _neighbour(self, camera: int) -> Neighbour:
-        found = self._neighbours.get(camera)
-        if found is None:
-            found = self._neighbours[camera] = Neighbour(
-                Edge(camera, self._rng, self._raw, reverse=camera < self.camera)
-            )
-        return found
+        if camera not in self._neighbours:
+            edge = Edge(camera, self._rng, self._raw, reverse=camera < self.camera)
+            self._neighbours[camera] = Neighbour(edge)
+        return self._neighbours[camera]
 
     def _pair(self, neighbour: Neighbour, row: tuple[float, ...]) -> list[Output]:
         neighbour.edge.add(row)

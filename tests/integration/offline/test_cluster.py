@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
+import distributed
 import numpy as np
 import pytest
 
 from deploy.cli import run
 from deploy.cluster import make_jobs
+from tests.support.crowds import boxes_csv, truth_csv, write_calibration
+from tests.support.samples import eventually
 from tests.support.videos import record_scene_videos, write_video
 
 
@@ -49,6 +56,60 @@ def test_jobs_on_a_cluster(videos: Path, tmp_path: Path, capsys: pytest.CaptureF
         "cam2",
         "empty",
     }
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """The address of a cluster of one worker process, which is started again where it ends."""
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster:
+        yield cluster.scheduler_address
+
+
+def test_follow_and_track_give_the_bytes_of_one_machine(scheduler: str, tmp_path: Path) -> None:
+    offsets = {"left": 0.0, "right": 12.5, "back": -3.25}
+    session, listed = tmp_path / "yard" / "monday", tmp_path / "cars.txt"
+    session.mkdir(parents=True)
+    (session / "boxes.csv").write_text(boxes_csv(3.0, 5.0, offsets), encoding="utf-8")
+    (session / "truth.csv").write_text(truth_csv(3.0, 5.0), encoding="utf-8")
+    write_calibration(tmp_path / "calibration.toml", offsets=offsets)
+    rng = np.random.default_rng(3)
+    ground = rng.integers(60, 200, (120, 160, 3), dtype=np.uint8)
+    frames = [ground.copy() for _ in range(12)]
+    for number, image in enumerate(frames):
+        image[50:66, 20 + 4 * number : 56 + 4 * number] = (40, 40, 210)
+    write_video(tmp_path / "car.mp4", frames, np.arange(12) / 25.0)
+    listed.write_text(f"{tmp_path / 'car.mp4'} --target 20,50,36,16\n", encoding="utf-8")
+    follow = ["--calibration", str(tmp_path / "calibration.toml")]
+    for command, together, alone, file in (
+        ("follow", [str(session.parent), *follow], [str(session), *follow], "monday/tracks.csv"),
+        ("track", [str(listed)], [str(tmp_path / "car.mp4"), "--target", "20,50,36,16"], "car/track.csv"),
+    ):
+        out, own = tmp_path / command, tmp_path / f"{command}-alone"
+        assert run([command, *together, "--out", str(out), "--scheduler", scheduler]) == 0
+        assert run([command, *alone, "--out", str(own)]) == 0
+        assert (out / file).read_bytes() == (own / Path(file).name).read_bytes()
+
+
+def test_the_job_of_a_lost_worker_is_done_by_another(videos: Path, scheduler: str, tmp_path: Path) -> None:
+    listed, killed = tmp_path / "one.txt", list[int]()
+    listed.write_text(f"{videos / 'cam0.mp4'}\n", encoding="utf-8")
+
+    def kill_the_worker() -> None:
+        with distributed.Client(scheduler) as client:
+            (process,) = client.run(os.getpid).values()
+            if eventually(lambda: any(client.processing().values()), 30.0):
+                killed.append(process)
+                os.kill(process, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill_the_worker)
+    killer.start()
+    out = tmp_path / "seen"
+    assert run(["detect", "marker", str(listed), "--out", str(out), "--scheduler", scheduler]) == 0
+    killer.join(60.0)
+    assert killed, "the job ended before its worker could be killed"
+    alone = tmp_path / "alone.csv"
+    assert run(["detect", "marker", str(videos / "cam0.mp4"), "--out", str(alone)]) == 0
+    assert (out / "cam0.csv").read_bytes() == alone.read_bytes()
 
 
 def test_a_list_gives_each_input_options_of_its_own(tmp_path: Path) -> None:

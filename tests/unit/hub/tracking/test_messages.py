@@ -16,7 +16,7 @@ from tests.support.people_traffic import film
 
 
 @cache
-def published(every_s: float) -> list[Message]:
+def published(every_s: float, live: LiveTracking | None = None) -> list[Message]:
     """Messages of a hub that ticks every ``every_s``, for three seconds of two people in three cameras."""
     scene = scenes.get_people_scene(3, 3, 2)
     traffic = film(scene, 3.0, 3)
@@ -26,7 +26,7 @@ def published(every_s: float) -> list[Message]:
         cameras[camera.name] = CameraCalibration(
             camera.name, camera.intrinsics, camera.pose, time_map, 1e-4, np.zeros(3), 0.5
         )
-    live, due, out = LiveTracking(), 0.0, []
+    live, due, out = live or LiveTracking(), 0.0, []
     live.calibrate(cameras, {}, reference=traffic.reference, scale="metric", units="m", up=np.array([0.0, 0.0, 1.0]))
     for arrival, message in traffic.arrivals:
         live.handle(message)
@@ -54,3 +54,11 @@ def test_a_delayed_hub_publishes_the_missed_times() -> None:
 def test_no_predictions_are_published_for_past_times() -> None:
     predictions = [message for message in published(0.4) if isinstance(message, pb.Prediction)]
     assert 5 <= len(predictions) <= 9
+
+
+def test_without_predictions_the_tracks_are_the_same_and_each_prediction_left_out_is_counted() -> None:
+    live = LiveTracking()
+    live.predicts = False
+    assert published(0.4, live) == tracks(0.4)
+    left_out = sum(isinstance(message, pb.Prediction) for message in published(0.4))
+    assert live.counters["shed.predictions"] == left_out
