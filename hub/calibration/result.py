@@ -12,6 +12,7 @@ from hub.bundle.adjustment import predict, residual_norms
 from hub.bundle.datum.control_outliers import reject_outliers, reject_refuted
 from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
 from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state, with_exact_poses
+from hub.bundle.datum.held_gauge import similarity_to_published
 from hub.bundle.initialisation import Reconstruction
 from hub.bundle.model_comparison import REFUTED_SIGMA
 from hub.bundle.noise_scale import rescale_noise
@@ -19,7 +20,6 @@ from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
-from hub.calibration.held_gauge import similarity_to_published
 from hub.calibration.pair_network import RATE_TOLERANCE, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
 from hub.calibration.solution import Solution
