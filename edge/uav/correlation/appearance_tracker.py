@@ -202,14 +202,18 @@ class AppearanceTracker:
         else:
             self._searching = self._belief.gone
             self._miss(dt)
-        if self._frame % (_OBSERVE_EVERY if self.certain else _OBSERVE_DOUBTFUL_EVERY) == 0:
+        if self._frame % _OBSERVE_EVERY == 0:
             self._observe_background(image, box)
+        elif not self.certain and self._frame % _OBSERVE_DOUBTFUL_EVERY == 0:
+            self._observe_rivals(image, box)
 
     def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
         self._broken = False
         inside = box.share_inside(self._size)
-        self._motion_filter.correct(box.centre - self.box.centre, self.length, 1.0 - inside)
+        # Where it looks less like the target than what is beside it, it says little about how the target moves.
+        unsure = 1.0 - inside if self._ratio > 0.0 else 1.0
+        self._motion_filter.correct(box.centre - self.box.centre, self.length, unsure)
         if inside > _LEARN_INSIDE:
             wider, higher, turn = self._flow.change(image, box.centre)
             box = box.sized(box.sides * [wider, higher]).turned(turn)
@@ -270,13 +274,21 @@ class AppearanceTracker:
 
     def _observe_background(self, image: Image, box: OrientedBox) -> None:
         """Scores of what lies around the target, and in another part of the image each time."""
-        index = self._frame // _OBSERVE_EVERY
-        for where, reach in ((box, 2.0 * box.sides), tile(box, self._size, index)):
-            found = search(image, self._memory, where, reach, 8)
-            away = [f.score for f in found if np.abs(box.axes.T @ (f.box.centre - box.centre) / box.sides).max() > 0.7]
-            self._memory.observe_background(np.array(away), float(np.prod(1.0 + 2.0 * reach / box.sides)))
-            if where is box and away:
-                self._memory.observe_rival(max(away))
+        self._observe_rivals(image, box)
+        self._observe_places(image, box, *tile(box, self._size, self._frame // _OBSERVE_EVERY))
+
+    def _observe_rivals(self, image: Image, box: OrientedBox) -> None:
+        """Scores of what lies beside the target."""
+        beside = self._observe_places(image, box, box, 2.0 * box.sides)
+        if beside:
+            self._memory.observe_rival(max(beside))
+
+    def _observe_places(self, image: Image, box: OrientedBox, where: OrientedBox, reach: Floats) -> list[float]:
+        """Scores of the best places within ``reach`` of a box, off the target."""
+        found = search(image, self._memory, where, reach, 8)
+        away = [f.score for f in found if np.abs(box.axes.T @ (f.box.centre - box.centre) / box.sides).max() > 0.7]
+        self._memory.observe_background(np.array(away), float(np.prod(1.0 + 2.0 * reach / box.sides)))
+        return away
 
     def _miss(self, dt: float) -> None:
         if self._missed == 0:

@@ -21,7 +21,7 @@ _ANYWHERE_RATE = 0.01  # at which a target is not near its prediction any more [
 _PROPOSED = -2.0  # log prior of a place that another tracker has found
 _PROMISING = 0.0  # log odds of a place under test above which others are searched in every second frame only
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
-_MOST_TESTED = 2
+_MOST_TESTED, _RIVAL_MARGIN = 2, 2.0  # places that are tested at once; log odds within which one is a rival
 _DETECTION = 0.25  # probability that one search finds a target in view
 _CHANGE = 0.1  # std of the similarity of a target that has been away
 _MIN_INSIDE = 0.6  # share of a place in the image
@@ -88,11 +88,11 @@ class Redetection:
 
     def _search(self, image: Image, expected: Prediction, dt: float) -> None:
         """Take up the likeliest new place: in turn about the prediction, and in one tile after the other."""
-        box, k = expected.box, expected.frames
-        box = box.sized(box.sides * _SIZES[k // 2 % len(_SIZES)]).turned(_ANGLES[k // 2 % len(_ANGLES)])
+        box, turn = expected.box, expected.frames // 2
+        box = box.sized(box.sides * _SIZES[turn % len(_SIZES)]).turned(_ANGLES[turn % len(_ANGLES)])
         reach = 3.0 * expected.std + 0.3 * box.sides
-        if k % 2:
-            box, reach = tile(box, self._size, k // 2)
+        if expected.frames % 2:
+            box, reach = tile(box, self._size, turn)
         else:
             # Where it was expected and is not seen, it is less and less likely to be.
             self._near *= 1.0 - _DETECTION * box.share_within(reach, self._size)
@@ -101,10 +101,13 @@ class Redetection:
             return
         priors = [self._log_prior(f.box.centre, expected) for f in new]
         odds = [self._memory.log_ratio(f.score, _CHANGE) + prior for f, prior in zip(new, priors, strict=True)]
-        best = int(np.argmax(odds))
-        candidate = Candidate(new[best].box, priors[best], expected.motion)
-        if odds[best] > _WORTH_A_TEST and self._test(image, candidate, expected, dt):
-            self._tested.append(candidate)
+        order = np.argsort(odds)[::-1]
+        for k in order[:_MOST_TESTED]:
+            # A rival that is about as likely is tested beside the likeliest one.
+            if odds[k] > max(_WORTH_A_TEST, odds[order[0]] - _RIVAL_MARGIN):
+                candidate = Candidate(new[k].box, priors[k], expected.motion)
+                if self._test(image, candidate, expected, dt):
+                    self._tested.append(candidate)
 
     def _log_prior(self, place: Floats, expected: Prediction) -> float:
         """Log probability that the target is in the box about ``place`` (2,): near the prediction, or anywhere."""
