@@ -43,6 +43,7 @@ wide or narrow that a lens is mistaken by more."""
 _SCALE_STEPS = (1.04, 1.02, 1.01, 1.005)
 _LIKELY_CANDIDATES, _MIN_SCALE_CHANGE = 4, 0.03
 """Candidates of the moment scan, which does not use the lens, whose scale is searched; scale that the lens gives."""
+_TRIMS = 2  # fits of a pose to the better half of the points
 _MIN_INLIERS, _MIN_CANDIDATE_RATIO = 0.8, 4.0
 """Share of the common rows that a time map without any bound from a clock has to explain, and cost of the next best."""
 
@@ -149,17 +150,18 @@ def find_time_map(
     labels = [(i, tracks[label]) for i, label in enumerate(reconstruction.labels) if label in tracks]
     if not labels:
         return None, "no label that the others saw"
-    found = sorted(_moment_scan(labels, reconstruction, rates[0]), key=lambda one: one.score)
-    likely = found[:_LIKELY_CANDIDATES]
-    if likely and _misfit([_verify(one, labels, reconstruction, camera) for one in likely]):
+    nominal = sorted(_moment_scan(labels, reconstruction, rates[0]), key=lambda one: one.score)
+    verified = [_verify(one, labels, reconstruction, camera) for one in nominal[:_LIKELY_CANDIDATES]]
+    if verified and _misfit(verified):
+        likely = nominal[:_LIKELY_CANDIDATES]
         reason = _other_image([_verify(one, labels, reconstruction, camera, _SCALES) for one in likely])
         if reason:
             return None, reason
-    found += [candidate for rate in rates[1:] for candidate in _moment_scan(labels, reconstruction, rate)]
-    found = sorted(found, key=lambda one: one.score)[:_CANDIDATES]
-    if not found:
+    found = [candidate for rate in rates[1:] for candidate in _moment_scan(labels, reconstruction, rate)]
+    found = sorted([*found, *nominal[_LIKELY_CANDIDATES:]], key=lambda one: one.score)[: _CANDIDATES - len(verified)]
+    verified += [_verify(one, labels, reconstruction, camera) for one in found]
+    if not verified:
         return None, "too little seen together with the other cameras"
-    verified = [_verify(one, labels, reconstruction, camera) for one in found]
     if reason := _misfit(verified):
         return None, reason
     best = _best_and_next(verified)[0]
@@ -329,14 +331,34 @@ def _best_and_next(verified: list[_Verified]) -> tuple[_Verified, float]:
 
 
 def _resected_residuals(positions: Floats, seen: Floats, others: Floats, others_seen: Floats, focal: float) -> Floats:
-    """Residuals [px] of ``others`` under the pose that fits ``positions`` best; inf behind the camera."""
+    """Residuals [px] of ``others`` under the pose that fits ``positions`` best; inf behind the camera.
+
+    Where most of the points are not explained, the pose is fitted again to the better half: a few false detections far
+    off displace a pose by more than the right one's residuals.
+    """
+    pose = _resect(positions, seen)
+    for _ in range(_TRIMS):
+        residual = _reprojection(pose, positions, seen, focal)
+        typical = float(np.median(residual))
+        if typical < _TRUNCATION_PX or not np.isfinite(typical):
+            break
+        pose = _resect(positions[residual <= typical], seen[residual <= typical])
+    return _reprojection(pose, others, others_seen, focal)
+
+
+def _resect(positions: Floats, seen: Floats) -> tuple[Floats, Floats] | None:
+    """Rotation and shift of a camera by its view of points; None where there is none."""
     try:
         found, rotation, shift = cv2.solvePnP(positions, seen, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_SQPNP)
     except cv2.error:  # all points in one place
-        found = False
-    if not found:
-        return np.full(len(others), np.inf)
-    local = others @ cv2.Rodrigues(rotation)[0].T + shift.ravel()
+        return None
+    return (np.asarray(cv2.Rodrigues(rotation)[0]), np.asarray(shift.ravel())) if found else None
+
+
+def _reprojection(pose: tuple[Floats, Floats] | None, positions: Floats, seen: Floats, focal: float) -> Floats:
+    if pose is None:
+        return np.full(len(positions), np.inf)
+    local = positions @ pose[0].T + pose[1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        residual = focal * np.linalg.norm(local[:, :2] / local[:, 2:] - others_seen, axis=1)
+        residual = focal * np.linalg.norm(local[:, :2] / local[:, 2:] - seen, axis=1)
     return np.where((local[:, 2] > 0) & np.isfinite(residual), residual, np.inf)

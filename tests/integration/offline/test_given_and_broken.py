@@ -11,6 +11,7 @@ import pytest
 from hub.bundle import model_comparison
 from hub.bundle.preprocessing import prepare
 from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations
+from hub.calibration import resection_scan
 from hub.calibration.pair_network import solve_pairs
 from hub.calibration.pipeline import calibrate, solve_network
 from hub.calibration.resection_scan import find_time_map
@@ -108,6 +109,29 @@ def test_resection_tells_a_wrong_lens_and_a_mirrored_image_from_a_camera_that_sa
         found, reason = find_time_map(prepare(broken.rig, broken.observations()).cameras["cam3"], path, (1.0,))
         assert found is None
         assert words in reason
+
+
+def test_candidates_at_other_frame_rates_do_not_displace_those_at_the_nominal_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    session = rigs.simulate(2, 4, 30.0)
+    good = broken_cameras.without(session, "cam3")
+    prepared, pairs = solve_pairs(prepare(good.rig, good.observations()), lambda text, share: None)
+    path = solve_network(prepared, pairs, lambda text, share: None).reconstruction
+    scan = resection_scan._moment_scan
+    crowd = [resection_scan.TimeMapCandidate(2.0, float(lag), 0.0, 10.0) for lag in range(20)]
+    monkeypatch.setattr(resection_scan, "_moment_scan", lambda *of: scan(*of) if of[2] == 1.0 else crowd)
+    camera = prepare(session.rig, session.observations()).cameras["cam3"]
+    assert find_time_map(camera, path, (1.0, 2.0))[0] == find_time_map(camera, path, (1.0,))[0]
+
+
+def test_a_false_detection_that_stays_in_one_place_does_not_displace_a_resected_pose() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1.0, 1.0, (80, 3)) + [0.0, 0.0, 4.0]
+    seen = points[:, :2] / points[:, 2:]
+    seen[:12] = [0.4, -0.3]
+    residual = resection_scan._resected_residuals(points, seen, points, seen, 500.0)
+    assert np.median(residual[12:]) < 1.0
 
 
 def test_a_broken_camera_does_not_get_the_long_search_that_a_pair_alone_gets(monkeypatch: pytest.MonkeyPatch) -> None:
