@@ -76,6 +76,7 @@ def publish(rig: Rig, solution: BodySolution) -> Calibration:
             focal_std=stds[name],
             readout=state.cameras[i].readout,
             lag_time=state.cameras[i].centre + problem.views[i].time_origin,
+            lag_std=_relative_std(covariance, i, reference, OFFSET),
             clock_rate_std=_relative_std(covariance, i, reference, RATE),
         )
         for i, name in enumerate(names)
