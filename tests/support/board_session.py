@@ -52,8 +52,13 @@ class BoardWorld:
         }
         return Rig(cameras, bodies={"board": {label: scale * point for label, point in self.points.items()}})
 
-    def views(self, seconds: float, seed: int, jitter: float = 0.0) -> Iterator[tuple[str, int, float, Floats]]:
-        """Camera, frame, camera time and the corners' pixels (n, 2) of every frame that faces the board."""
+    def views(
+        self, seconds: float, seed: int, jitter: float = 0.0, readout: float = 0.0
+    ) -> Iterator[tuple[str, int, float, Floats]]:
+        """Camera, frame, camera time and the corners' pixels (n, 2) of every frame that faces the board.
+
+        readout: seconds from the first row of an image to its last.
+        """
         rng = np.random.default_rng(seed)
         points = np.array(list(self.points.values()))
         centred = points - points.mean(axis=0)
@@ -66,15 +71,21 @@ class BoardWorld:
                 if -turn[:, 2] @ away < 0.35 * np.linalg.norm(away):
                     continue
                 pixels = camera.lens.project(camera.pose.camera_from_world(centred @ turn.T + place))
+                for row, late in enumerate(
+                    readout * (pixels[:, 1] / (camera.lens.height - 1) - 0.5) if readout else ()
+                ):
+                    turn, place = self.board(true + float(late) * camera.rate)
+                    point = camera.pose.camera_from_world(centred[row : row + 1] @ turn.T + place)
+                    pixels[row] = camera.lens.project(point)[0]
                 yield name, frame, time, pixels
 
     def observations(
-        self, seconds: float = 10.0, noise: float = 0.15, seed: int = 0, jitter: float = 0.0
+        self, seconds: float = 10.0, noise: float = 0.15, seed: int = 0, jitter: float = 0.0, readout: float = 0.0
     ) -> Observations:
         """The corners inside the images, with noise [px]."""
         rng = np.random.default_rng(seed + 1000)
         cameras, labels, frames, times, seen = [], [], [], [], []
-        for name, frame, time, pixels in self.views(seconds, seed, jitter):
+        for name, frame, time, pixels in self.views(seconds, seed, jitter, readout):
             lens = self.cameras[name].lens
             inside = np.isfinite(pixels).all(axis=1) & (pixels > 4).all(axis=1)
             inside &= (pixels < [lens.width - 5, lens.height - 5]).all(axis=1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.bundle.problem import ASPECT, CENTRE, FOCAL, K1, K2, K3, OFFSET, P1, RATE
+from hub.bundle.problem import ASPECT, CENTRE, FOCAL, K1, K2, K3, OFFSET, P1, RATE, READOUT
 from hub.bundle.residuals import ResidualEvaluation, SplineSupport, evaluate_points, jacobians
 from hub.calibration.rigid_body.lag import rotations
 from hub.calibration.rigid_body.motion import POSE, BodyMotion, rotated
@@ -20,6 +20,7 @@ BLOCK = SUPPORT * POSE
 _PRIOR_STD = {K1: 0.3, K2: 0.3, K3: 0.2, ASPECT: 2e-3, P1: 1e-3, P1 + 1: 1e-3}
 _CENTRE_STD = 0.02  # of the larger image side
 _RATE_STD = 1e-3  # of a clock's rate: ten times a crystal's
+_READOUT_STD = 0.02  # s: from none to a frame interval at 30 fps
 NORM_STD = 0.1
 """Of a control quaternion's squared norm about 1."""
 _RIDGE = 1e-10  # relative: gaps that only the smoothness prior bridges are singular to rounding
@@ -91,7 +92,7 @@ def linearised_rows(problem: BodyProblem, state: BodyState, camera: int, robust:
             control[mine] = body.control[at[:, None] + np.arange(SUPPORT)]
         first += len(body.control)
     # Rows of a rolling shutter are read at other times than the middle row: the view's pose moves on at its velocity.
-    late = problem.readout[camera] * now.row_offset(views.pixels) * now.rate
+    late = now.readout * now.row_offset(views.pixels) * now.rate if problem.clock else np.zeros(len(views.pixels))
     row_weights = weights[views.view] + late[:, None] * slopes[views.view]
     pose = np.einsum("nk,nkp->np", row_weights, control[views.view])
     velocity = np.einsum("vk,vkp->vp", slopes, control)[views.view]
@@ -279,11 +280,13 @@ def _add_priors(
 
 
 def camera_priors(problem: BodyProblem, state: BodyState) -> list[tuple[int, int, float, float]]:
-    """Camera, column, difference and std of every prior on rates and lenses."""
+    """Camera, column, difference and std of every prior on rates, readouts and lenses."""
     out: list[tuple[int, int, float, float]] = []
     for camera, (now, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):
         if problem.clock and camera != problem.reference:
             out.append((camera, RATE, now.rate - 1.0, _RATE_STD))
+        if problem.clock and problem.free_readout[camera]:
+            out.append((camera, READOUT, now.readout, _READOUT_STD))
         if not problem.free_lens[camera]:
             continue
         lens = now.intrinsics

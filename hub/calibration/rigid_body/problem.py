@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.bundle.problem import ASPECT, CENTRE, FOCAL, K1, K2, K3, OFFSET, P1, RATE, CameraState
+from hub.bundle.problem import ASPECT, CENTRE, FOCAL, K1, K2, K3, OFFSET, P1, RATE, READOUT, CameraState
 from hub.calibration.rigid_body.motion import BodyMotion
 from hub.calibration.rigid_body.views import CameraViews
 from protocols.geometry.camera import Intrinsics
@@ -25,7 +25,7 @@ class BodyProblem:
 
     views: what was seen. nominal: prior means of the lenses. free_lens: whether it is estimated. fixed: whether the
     camera's pose is given. reference: the camera that fixes clock and, where no pose is given, the world. clock:
-    whether clocks are estimated. readout: seconds from an image's first row to its last. use: rows that fit.
+    whether clocks are estimated. free_readout: whether the readout of its rows is estimated. use: rows that fit.
     free_shape: whether the body's points are estimated, with the described ones as prior means.
     """
 
@@ -35,7 +35,7 @@ class BodyProblem:
     fixed: tuple[bool, ...]
     reference: int
     clock: bool
-    readout: tuple[float, ...]
+    free_readout: tuple[bool, ...]
     use: tuple[Bools, ...]
     free_shape: bool = False
 
@@ -46,6 +46,8 @@ class BodyProblem:
             out += range(6)
         if self.clock and camera != self.reference:
             out += [OFFSET, RATE]
+        if self.clock and self.free_readout[camera]:
+            out.append(READOUT)
         if self.free_lens[camera]:
             out += LENS[: 7 if self.nominal[camera].fisheye else None]
         return out

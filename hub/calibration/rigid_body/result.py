@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hub.bundle.datum.gauge import fix_gauge
-from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, RATE
+from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, RATE, READOUT
 from hub.calibration.rigid_body.lag import BodyPair
 from hub.calibration.rigid_body.noise import residuals
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval
@@ -75,7 +75,9 @@ def publish(rig: Rig, solution: BodySolution) -> Calibration:
             rms_px=_rms(problem, state, i),
             focal_std=stds[name],
             readout=state.cameras[i].readout,
+            readout_std=covariance.std(i, READOUT),
             lag_time=state.cameras[i].centre + problem.views[i].time_origin,
+            lag_std=_relative_std(covariance, i, reference, OFFSET),
             clock_rate_std=_relative_std(covariance, i, reference, RATE),
         )
         for i, name in enumerate(names)
@@ -169,7 +171,13 @@ def _notes(solution: BodySolution, cameras: Mapping[str, CameraCalibration]) -> 
         for name, std in zip(solution.names, solution.state.jitter.tolist(), strict=True)
         if std > 0.0
     )
-    return lenses + jitter
+    readouts = tuple(
+        f"{name}: its rolling-shutter readout was estimated from the board: {1e3 * camera.readout:.1f} ms from the "
+        f"first row to the last ± {1e3 * camera.readout_std:.1f} ms (std)"
+        for name, camera in cameras.items()
+        if abs(camera.readout) > 3.0 * camera.readout_std > 0.0
+    )
+    return lenses + jitter + readouts
 
 
 def _trajectories(

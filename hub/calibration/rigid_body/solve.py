@@ -142,7 +142,8 @@ def _solve(given: _Input, report: Progress, shared_clock: bool) -> BodySolution:
             tuple(given.known is not None for _ in names),
             0,
             not shared_clock,
-            tuple(0.0 if shared_clock else readouts[name] for name in names),
+            # Rolling shutters bend what is seen of a moving board, as unknown lenses do.
+            tuple(given.free_lens[name] and given.rig.cameras[name].readout is None for name in names),
             tuple(np.ones(len(one.view), dtype=np.bool_) for one in views),
             len(given.rig.bodies) == 1 and len(given.labels) >= _MIN_SHAPE_POINTS,
         )

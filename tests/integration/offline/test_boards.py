@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tomllib
 from pathlib import Path
@@ -57,6 +58,8 @@ def test_two_clips_of_a_board_give_clocks_poses_lenses_and_metres(
     clock = cameras["GoPro 2"].time_map
     expected = second.rate * at + second.offset
     assert abs(clock.clock_rate * at + clock.time_offset - expected) < 0.005
+    stated = json.loads((out / "result.json").read_text())["cameras"]["GoPro 2"]
+    assert stated["lag_std_s"] == cameras["GoPro 2"].time_offset_std > 0.0
     session = tomllib.loads((out / "session" / "rig.toml").read_text())
     assert len(session["metadata"]["bodies"]["board"]) == 35
 

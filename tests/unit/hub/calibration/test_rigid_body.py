@@ -66,6 +66,15 @@ def test_lenses_are_estimated_from_the_same_views_with_their_stds() -> None:
         assert off < 4.0 * camera.focal_std
 
 
+def test_the_readout_of_rolling_shutters_is_estimated_and_leaves_the_lenses_alone() -> None:
+    world = board_world(6, (10.0, 10.0))
+    found = calibrate(world.rig(lenses=False), world.observations(8.0, readout=0.015))
+    for name, camera in found.cameras.items():
+        assert 0.0 < camera.readout_std < 0.001
+        assert abs(camera.readout - 0.015) < 4.0 * camera.readout_std
+        assert abs(camera.intrinsics.focal / world.cameras[name].lens.focal - 1.0) < 4.0 * camera.focal_std
+
+
 def test_time_errors_of_single_frames_are_estimated() -> None:
     world = board_world(7)
     found = calibrate(world.rig(), world.observations(jitter=0.02))
