@@ -19,7 +19,7 @@ from protocols.geometry.types import Floats
 _MARGIN = 1.0  # log odds by which a place must exceed the next best one, and the one under test
 _ANYWHERE_RATE = 0.01  # at which a target is not near its prediction any more [1/s]
 _PROPOSED = -2.0  # log prior of a place that another tracker has found
-_PROMISING = 0.0  # log odds of a place under test above which others are searched in every second frame only
+_PROMISING = 0.0  # log odds of a place under test above which others are searched about the prediction only
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
 _MOST_TESTED, _RIVAL_MARGIN = 2, 2.0  # places that are tested at once; log odds within which one is a rival
 _DETECTION = 0.25  # probability that one search finds a target in view
@@ -75,7 +75,7 @@ class Redetection:
         """Search one image; the place that is taken for the target, if any: by its odds, and a margin over the next."""
         self.debug = {}
         self._tested = [c for c in self._tested if self._test(image, c, expected, dt)]
-        if not self._tested or self._tested[0].log_odds < _PROMISING or expected.frames % 2:
+        if not self._tested or self._tested[0].log_odds < _PROMISING or expected.frames % 2 == 0:
             self._search(image, expected, dt)
         self._tested.sort(key=lambda c: -c.log_odds)
         del self._tested[_MOST_TESTED:]

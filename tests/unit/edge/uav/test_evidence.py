@@ -8,9 +8,10 @@ import pytest
 
 from edge.uav import adaptive_tracker
 from edge.uav.base import Box, TrackState
+from edge.uav.correlation import redetection
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.belief import Belief
-from edge.uav.correlation.candidate import Kinematics
+from edge.uav.correlation.candidate import Candidate, Kinematics
 from edge.uav.correlation.filter import CorrelationFilter, Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -166,6 +167,27 @@ def test_of_two_places_that_look_alike_none_is_claimed(scene: np.ndarray) -> Non
     states = track(images, 160.0, 120.0)
     assert states[15] is TrackState.VISIBLE
     assert not any(state is TrackState.VISIBLE for state in states[24:])
+
+
+def test_a_place_found_elsewhere_is_compared_with_the_predicted_one(
+    scene: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched: list[tuple[float, float]] = []
+
+    def search(image: np.ndarray, memory: TemplateMemory, box: OrientedBox, reach: np.ndarray) -> list[object]:
+        searched.append((float(box.centre[0]), float(box.centre[1])))
+        return []
+
+    monkeypatch.setattr(redetection, "search", search)
+    monkeypatch.setattr(redetection.Redetection, "_test", lambda *_: True)
+    away = redetection.Redetection(SIZE, TemplateMemory(), lambda image, box: (box, Response(0.0, 0.0, 0.2, 1.0)))
+    box = OrientedBox(400.0, 300.0, *map(float, TARGET))
+    still = Kinematics(np.zeros(2), 1.0, float(TARGET[0]))
+    promising = Candidate(box.at(np.array([100.0, 100.0])), 4.0, still, hits=1)
+    away._tested = [promising]
+    for frames in (10, 11):
+        away.look(scene, redetection.Prediction(box, 20.0, still, frames, frames / FPS), 1.0 / FPS)
+    assert (400.0, 300.0) in searched
 
 
 def test_a_distant_car_is_small() -> None:
