@@ -1,4 +1,4 @@
-"""The size of the house: source lines, constants that give no reason, complexity. Where a figure rises, the commit says for what."""
+"""The size of the house: source lines, constants without a reason, complexity. A figure that rises is explained."""
 
 from __future__ import annotations
 
