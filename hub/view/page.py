@@ -199,16 +199,20 @@ class ViewPage:
             player.playing = not player.playing
             if player.playing and player.position >= player.duration:
                 player.seek_to = 0.0
-            self._play.label = "Pause" if player.playing else "Play"
+            self._show_time(player)
 
         @self._speed.on_update
         def _(event: Any) -> None:
             player.speed = float(self._speed.value)
 
     def _show_time(self, player: Player) -> None:
+        # The time before the button: who reads "Play" and types a time must not have it overwritten by a late one.
+        self._show_position(player)
         label = "Pause" if player.playing else "Play"
         if self._play.label != label:
             self._play.label = label
+
+    def _show_position(self, player: Player) -> None:
         value = min(round(player.position, 1), self._time.max)
         if player.seek_to is not None:
             return
