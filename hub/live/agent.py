@@ -39,7 +39,7 @@ ROLE = "hub"
 _TICK_S = 0.05  # s: of the hub's loop, below a frame at 15 Hz
 _ROUND_S = 0.012
 """Least time between two rounds: observations that arrive closer together are processed together."""
-_MESSAGES_S = 0.4
+_MESSAGES_S = 0.2
 """What the messages of a round may take together: tracks, and the status within 2 s, are published between rounds."""
 _BACKLOG_S = 2.0
 """After its start a hub gets what cameras had published before, all at once."""
@@ -151,11 +151,10 @@ class _HubAgent:
         if self._hub.nodes is not None and self._watch is not None:
             for event in self._watch.drain():
                 self._hub.nodes.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
-        received = [one for subscription in self._subscriptions for one in subscription.drain()]
-        self._shares.take(received)
+        self._shares.take(one for subscription in self._subscriptions for one in subscription.drain())
         now = time.monotonic()
         if now >= self._began + _BACKLOG_S:
-            self._shedding.see(self._shares.age_s(received, time.time_ns()), now)
+            self._shedding.see(self._shares.age_s(time.time_ns()), now)
 
     def obey(self, export: Callable[[LiveHub], str] | None) -> None:
         """Do what a view has asked for."""

@@ -9,8 +9,8 @@ from statistics import median_high
 from protocols.bus.base import Received
 from protocols.messages import syncline_pb2 as pb
 
-_MAX_WAITING_ROWS, _MAX_WAITING_IN_ALL = 40_000, 200_000
-"""Messages and detections of one sender that wait, and of all, some 100 bytes each; the oldest are dropped, of who has
+_MAX_WAITING_ROWS, _MAX_WAITING_IN_ALL = 40_000, 100_000
+"""Messages and detections of one sender that wait, and of all, 180 bytes each; the oldest are dropped, of who has
 most of them where all together have too many."""
 _LEAST_SHARE_S = 0.01  # s of CPU a second that every sender has
 
@@ -27,6 +27,7 @@ class FairShare:
         self._waiting: dict[str, deque[Received]] = {}
         self._rows: Counter[str] = Counter()
         self._in_all = 0
+        self._taken_ns: dict[str, int] = {}
         self.dropped: Counter[str] = Counter()
 
     @property
@@ -34,24 +35,23 @@ class FairShare:
         """Senders whose messages wait."""
         return sorted(self._waiting)
 
-    def age_s(self, received: Iterable[Received], now_ns: int) -> float:
-        """Age [s] of the oldest message of the median sender, of what has just been taken and of what waits.
+    def age_s(self, now_ns: int) -> float:
+        """Age [s] of the oldest message of the median sender, of what was taken last and of what waits.
 
         Not of the oldest of all: one who sends too much waits for itself, and costs the others nothing.
         """
-        oldest = {sender: queue[0].arrival_ns for sender, queue in self._waiting.items()}
-        for one in received:
-            oldest.setdefault(one.agent, one.arrival_ns)
+        oldest = self._taken_ns | {sender: queue[0].arrival_ns for sender, queue in self._waiting.items()}
         return max(0.0, 1e-9 * (now_ns - median_high(oldest.values()))) if oldest else 0.0
 
     def take(self, received: Iterable[Received]) -> None:
         """Pass on what has arrived, and of what waits as much as there is time for."""
-        received = list(received)
+        arrived = deque(received)
         begin = self._clock()
-        senders = {one.agent for one in received} | set(self._waiting)
-        share = max(self._round_s / max(len(senders), 1), _LEAST_SHARE_S)
+        self._taken_ns = {one.agent: one.arrival_ns for one in reversed(arrived)}
+        share = max(self._round_s / max(len(self._taken_ns.keys() | self._waiting.keys()), 1), _LEAST_SHARE_S)
         used: Counter[str] = Counter()
-        for one in received:
+        while arrived:  # none is held longer than it waits
+            one = arrived.popleft()
             if one.agent in self._waiting or used[one.agent] > share or self._clock() - begin > self._round_s:
                 self._put(one)
             else:

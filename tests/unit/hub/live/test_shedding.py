@@ -43,9 +43,12 @@ def test_one_who_sends_too_much_makes_the_hub_late_for_nobody_else() -> None:
         return Received(OBSERVATION, camera, pb.Observation(camera=camera), -round(age_s * 1e9))
 
     flooded = [received("flood", 9.0), *(received(camera, 0.01) for camera in "abc")]
-    assert shares.age_s(flooded, 0) == pytest.approx(0.01)
-    assert shares.age_s([received(camera, 0.7) for camera in "abc"], 0) == pytest.approx(0.7)
-    assert shares.age_s([], 0) == 0.0
+    shares.take(flooded)
+    assert shares.age_s(0) == pytest.approx(0.01)
+    shares.take([received(camera, 0.7) for camera in "abc"])
+    assert shares.age_s(0) == pytest.approx(0.7)
+    shares.take([])
+    assert shares.age_s(0) == 0.0
 
 
 def test_a_late_hub_is_degraded_on_the_page_until_it_has_caught_up(monkeypatch: pytest.MonkeyPatch) -> None:
