@@ -16,7 +16,8 @@ from protocols.topics import Topic
 from protocols.validation.codec import MAX_PAYLOAD, Rejected, RejectionReason, admit, parse_key
 
 MAX_BYTES = 32 * 1024 * 1024
-"""Upper bound of one inbox in bytes, so that a reader that has stopped does not exhaust the memory."""
+"""Upper bound of one inbox in bytes, so that a reader that has stopped does not exhaust the memory; half of it of
+anything but images, which is five seconds of a thousand cameras at 30 Hz."""
 MAX_BYTES_OF_KEY = MAX_BYTES // 8
 """The same of one sender, four times as much of images: who floods pays, not the others."""
 BYTES_PER_S = 8 * 1024 * 1024
@@ -49,6 +50,7 @@ class Inbox:
         self._clock_ns = clock_ns
         self._capacity = topic.queue
         self._most_of_key = MAX_BYTES_OF_KEY * (4 if topic.bulky else 1)
+        self._most = MAX_BYTES if topic.bulky else MAX_BYTES // 2
         self._queues: dict[str, deque[_Queued]] = {}
         self._sizes: Counter[str] = Counter()
         self._length = self._bytes = self._order = 0
@@ -83,7 +85,7 @@ class Inbox:
                 self._ready.notify_all()
             while self._sizes[key] > self._most_of_key:
                 self._drop(key)
-            while self._length > self._capacity or self._bytes > MAX_BYTES:
+            while self._length > self._capacity or self._bytes > self._most:
                 by_count = self._length > self._capacity
                 self._drop(max(self._queues, key=lambda one: len(self._queues[one]) if by_count else self._sizes[one]))
 
