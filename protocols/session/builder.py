@@ -33,9 +33,9 @@ _MOVING = 20.0
 """Motion in a chunk [px] from which a camera saw its target move."""
 _MAX_CHUNK_ROWS = 8_000
 """Detections of one camera in a chunk: twelve points at 330 frames a second. A camera that floods costs only itself."""
-_MAX_ROWS = 750_000
-"""Detections of all cameras that a live hub holds, 64 bytes each: three minutes of 140 cameras at 30 Hz. Above, the
-camera with the most gives up its oldest."""
+_MAX_ROWS = 600_000
+"""Detections of all cameras that a live hub holds, 64 bytes each, and once more while they are solved: 20 s of a
+thousand cameras at 30 Hz. Above, the camera with the most gives up its oldest."""
 _MAX_LABELS = 256
 """Labels of one camera: whole bodies have 133 points."""
 _MAX_BOOTS = 8
