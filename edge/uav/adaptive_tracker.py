@@ -94,7 +94,8 @@ class AdaptiveTracker:
         if self._ground is None or self._trust < 1.0:
             return self._on_image(seen)
         if ground.state is TrackState.VISIBLE and seen.state is not TrackState.VISIBLE:
-            return self._on_ground(replace(ground, state=TrackState.COASTING, std=max(ground.std, seen.std)))
+            coasting = replace(ground, state=TrackState.COASTING, std=max(ground.std, seen.std))
+            return self._on_ground(self._corrected(coasting))
         if seen.state is TrackState.VISIBLE and ground.state is TrackState.VISIBLE:
             self._shift = np.array([seen.x - ground.x, seen.y - ground.y])
             self._sides = np.array([seen.width / ground.width, seen.height / ground.height])
@@ -175,7 +176,7 @@ class AdaptiveTracker:
 
     def _corrected(self, ground: Estimate) -> Estimate:
         """The ground's estimate with the offset and the size at which the appearance last saw the target."""
-        if ground.state is not TrackState.VISIBLE or self._sides is None:
+        if self._sides is None:
             return ground
         sides = self._sides * [ground.width, ground.height]
         return replace(

@@ -117,8 +117,10 @@ def flight(target: str, path: str, seed: int, rate: float, away_s: float, frames
     pairs = [world.rendered(i) for i in range(count)]
     box = np.array([(t.box.x, t.box.y, t.box.width, t.box.height) for _, t in pairs])
     visible = np.array([t.visible for _, t in pairs])
+    first = int(np.argmax(visible >= 0.99))  # nobody can mark a target that is behind a house
     kind = "rendered away" if path == "away" else "rendered"
-    return Sequence(f"{target} {path} {seed}", kind, [image for image, _ in pairs], box, rate, visible)
+    images = [image for image, _ in pairs[first:]]
+    return Sequence(f"{target} {path} {seed}", kind, images, box[first:], rate, visible[first:])
 
 
 def rendered(seeds: range) -> Iterator[Sequence]:

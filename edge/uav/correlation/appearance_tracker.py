@@ -29,9 +29,11 @@ _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _UNKNOWN_STEP = 0.1  # std of a step of the scene that could not be measured, over the image's width
+_FAST_PAN_S = 1.0  # in which a step in the image may be the camera's; over plain water or sky it is the target's
 _MOVES = 0.3  # speed over the scene at which a heading is given, in target lengths a second
 _LOST_STD, _LOST_AFTER_S = 8.0, 15.0  # in target lengths; as of the ground tracker
 _MAX_GROWTH = 8.0  # of a side since the first frame
+_ASPECT_S = 1.0  # in which the box returns to its first shape; the flow of what is seen in it sums up to another one
 _SCALE_GAIN = 0.5  # of the scale filter's correction, per frame
 _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or angle must gain
 _ANCHOR_STEP = 0.3  # share of the way to it
@@ -63,6 +65,7 @@ class AppearanceTracker:
         self._scale, self._flow, self._memory = ScaleFilter(), BoxFlow(), TemplateMemory()
         self._scene.update(image, None)
         self.motion: Motion = STILL
+        self._trusted_at = -np.inf
         self._filter.learn(image, self.box)
         self._scale.learn(image, self.box)
         self._flow.remember(image, self.box)
@@ -141,6 +144,7 @@ class AppearanceTracker:
         origin = box.centre
         if motion.trusted:
             linear = motion.matrix[:, :2]
+            self._trusted_at = self._time
             if self._missed == 0:
                 self._since_keyframe = _square(motion.matrix) @ self._since_keyframe
             origin = motion.at(box.centre, self._scene.reach)
@@ -149,7 +153,7 @@ class AppearanceTracker:
             if self._missed == 0:
                 box = box.sized(box.sides * motion.zoom).turned(turn)
             self._redetection.move(motion, self._scene.reach, dt)
-        elif self._missed:
+        elif self._missed or self._time - self._trusted_at < _FAST_PAN_S:
             self._motion_filter.lose_scene(_UNKNOWN_STEP * self._size[0])
         if self._missed:
             self._broken |= not motion.trusted
@@ -217,6 +221,7 @@ class AppearanceTracker:
         if inside > _LEARN_INSIDE:
             wider, higher, turn = self._flow.change(image, box.centre)
             box = box.sized(box.sides * [wider, higher]).turned(turn)
+            box = box.sized(box.sides * (self._aspect(box) ** (min(1.0, dt / _ASPECT_S) * np.array([0.5, -0.5]))))
             self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)
             if self._frame % 3 == 0:
                 box = self._anchored(image, box)
@@ -234,6 +239,11 @@ class AppearanceTracker:
             self._last_sight = box, self._motion_filter.velocity
         self.box = box
         self._flow.remember(image, box)
+
+    def _aspect(self, box: OrientedBox) -> float:
+        """Height over width, over that of the first box."""
+        shape = box.sides / self._first
+        return float(shape[1] / shape[0])
 
     def _respond(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, Response]:
         """The box at the peak of the filter's answer; a second look where the first was off centre."""

@@ -12,7 +12,7 @@ from edge.uav.correlation.filter import CorrelationFilter, windowed
 from edge.uav.correlation.oriented_box import OrientedBox, crop
 from edge.uav.correlation.scale import BoxFlow
 from edge.uav.image_motion.keyframe import Keyframe
-from edge.uav.image_motion.scene_motion import SceneMotion
+from edge.uav.image_motion.scene_motion import STILL, SceneMotion
 from edge.uav.tracker_factory import make_tracker
 from edge.uav.world.oblique.world import ObliqueWorld
 
@@ -208,6 +208,27 @@ def test_a_black_image_leaves_the_plain_image_as_the_basis(scene: Image) -> None
     black = tracker.handle_frame(np.zeros_like(images[0]), 1 / FPS)
     assert black.state is not TrackState.VISIBLE
     assert not tracker.motion.trusted
+
+
+def test_a_pan_that_could_not_be_measured_is_not_the_targets_velocity(
+    scene: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The target was predicted to go on as fast as the camera had panned, thousands of pixels away within seconds."""
+    tracker = AppearanceTracker(SIZE, FPS)
+    tracker.begin(*_window(scene, 0, 0), Box(143.0, 109.0, 34.0, 22.0))
+    for k in range(1, 10):
+        tracker.handle_frame(*_window(scene, 0, k))
+    monkeypatch.setattr(SceneMotion, "update", lambda *ignored: STILL)
+    for k in range(10, 14):
+        assert tracker.handle_frame(*_window(scene, 6 * (k - 9), k)).state is TrackState.VISIBLE
+    assert np.hypot(*tracker._motion_filter.velocity) < 1.0 * max(TARGET)
+
+
+def _window(scene: Image, right: int, k: int) -> tuple[Image, float]:
+    """A standing target, seen by a camera that has turned by some pixels to the right; time of frame k."""
+    world = scene.copy()
+    paint(world, 310, 320)
+    return np.ascontiguousarray(world[200:440, 150 + right : 470 + right]), k / FPS
 
 
 def test_the_truth_of_an_oblique_world_is_where_the_target_is_drawn() -> None:
