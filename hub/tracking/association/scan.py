@@ -44,7 +44,7 @@ from protocols.geometry.types import Floats, Ints
 
 MAX_SWEEPS = 4  # of coordinate descent over the frames of a scan
 _EXCHANGES = 2  # of whole scans, each followed by sweeps
-_REACH = 1.5  # heights: further apart, two people's detections in one scan are not exchanged
+_REACH = 1.0  # heights: further apart, two people's detections in one scan are not exchanged
 _IMPOSSIBLE, _TIE = -1e6, 1e-6
 """Log likelihood of a pair that is out of reach; by how much another order must be better."""
 MAX_LOG_ODDS = 9.0  # e^9: no single measurement may decide by more
