@@ -27,8 +27,12 @@ from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats, Ints
 
-ITERATIONS = 4
-"""Association, smoothing and linking. Of two crowds a fifth changed MOTA and IDF1 by less than 0.003."""
+ITERATIONS = 7
+"""Association, smoothing and linking. What follows a cut is judged one iteration later, so a person who is lost while
+somebody else appears beside takes three."""
+_WIDTHS = 3
+"""Exchanges are tried with so many scans left out, one number an iteration. After them only what is near a changed link
+is associated anew."""
 _INSIDE, _BESIDE = 0.99, 0.3
 """Existence of a target between its first and its last detection, and one scan before and after."""
 _MAX_GAP_S = 6.0
@@ -132,12 +136,14 @@ class BatchSmoother:
                 forward, backward = self._filter(1), self._filter(-1)
                 self._rates = self._entry_exit_rates(forward, backward)
                 self._link(forward, backward)
-            if 0 < number < iterations:
+            if 0 < number <= _WIDTHS:
                 forward, backward = self._filter(1), self._filter(-1)
                 self._rates = self._entry_exit_rates(forward, backward)
                 self._exchange(forward, backward, number)
             forward, backward = self._filter(1), self._filter(-1)
             out = self._associate(forward, backward, relink=number < iterations)
+            if number >= _WIDTHS:
+                self._changed[:] = False
             if progress is not None:
                 progress((number + 1) / (iterations + 1))
         return out

@@ -99,12 +99,17 @@ def association_scores(
     ) - 0.5 * np.log(2.0 * np.pi) * used.sum(axis=1)
     log_ratio[row, column] = log_likelihood - _log_clutter(frame, column, used, np.isfinite(value[column]))
     if np.isfinite(frame.colour).any():
-        off2 = ((frame.colour[column] - targets.colour[row]) ** 2).sum(axis=1)
-        score = 3.0 * np.log(_CLUTTER_COLOUR_STD / colour_std) - 0.5 * np.minimum(off2 / colour_std**2, _COLOUR_MAX)
-        log_ratio[row, column] += np.nan_to_num(score)
+        log_ratio[row, column] += colour_score(frame.colour[column], targets.colour[row], colour_std)
     if any(frame.target):
         log_ratio += _LOG_CAMERA_MATCH * (np.array(names)[:, None] == np.array(frame.target)[None, :])
     return AssociationScores(log_ratio, distance)
+
+
+def colour_score(observed: Floats, stored: Floats, std: float) -> Floats:
+    """Log likelihood ratios (k,) of colours (k, 3) of detections and targets against anything else's; 0 if unknown."""
+    off2 = ((observed - stored) ** 2).sum(axis=1)
+    score = 3.0 * np.log(_CLUTTER_COLOUR_STD / std) - 0.5 * np.minimum(off2 / std**2, _COLOUR_MAX)
+    return np.asarray(np.nan_to_num(score))
 
 
 def matched_noise(

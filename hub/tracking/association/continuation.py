@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY, log_density
-from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis
+from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis, log_mixture
 from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import Targets
 from protocols.geometry.types import Floats, Ints
@@ -85,10 +85,8 @@ def continuation_scores(
     if not len(a):
         return score
     total = past.covariance[a] + future.covariance[b]
-    odds = manoeuvre.prior_odds[a]
-    with np.errstate(divide="ignore"):
-        changed = log_density(off[a, b], manoeuvre.covariance[a] + future.covariance[b]) + np.log(odds)
-    fit = np.logaddexp(log_density(off[a, b], total), changed) - np.log1p(odds)
+    changed = log_density(off[a, b], manoeuvre.covariance[a] + future.covariance[b])
+    fit = log_mixture(manoeuvre.prior_odds[a], log_density(off[a, b], total), changed)
     # The same, had the future begun anywhere: position uniform, velocity and size from their priors.
     model = [TARGET_MODELS[kind] for kind in future.kind.tolist()]
     speed = np.array([one.speed_std_m_s for one in model]) * units_per_m

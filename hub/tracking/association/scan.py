@@ -3,7 +3,8 @@
 The tracker takes frames one after another. In a crowd, and at few frames a second, one camera alone cannot tell whose
 detection is whose, while all cameras of an instant together can. So the association of each frame of the scan is
 repeated given the detections of all others, until nothing changes: iterated conditional modes of the joint posterior
-(Besag 1986), one camera's assignment at a time.
+(Besag 1986), one camera's assignment at a time. All cameras may agree on a wrong one: the first exchanged two people,
+and the others followed. So what all frames say of each target is then assigned to the targets as a whole.
 """
 
 from __future__ import annotations
@@ -13,8 +14,16 @@ from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
-from hub.tracking.association.assignment import assign, association_scores, gated_rows, matched_noise, occlusions
+from hub.tracking.association.assignment import (
+    assign,
+    association_scores,
+    colour_score,
+    gated_rows,
+    matched_noise,
+    occlusions,
+)
 from hub.tracking.association.marginals import marginal_probabilities
 from hub.tracking.filter import kalman
 from hub.tracking.filter.detection_model import (
@@ -26,14 +35,18 @@ from hub.tracking.filter.detection_model import (
     visible_fraction,
     with_frame_noise,
 )
-from hub.tracking.filter.kalman import STATE_DIM
-from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis, widened_by_evidence
+from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM
+from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis, log_evidence, log_mixture, widened_by_evidence
 from hub.tracking.filter.measurement import PredictedMeasurement, predict_measurement
 from hub.tracking.filter.target_states import ScanFrame, Targets
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats, Ints
 
 MAX_SWEEPS = 4  # of coordinate descent over the frames of a scan
+_EXCHANGES = 2  # of whole scans, each followed by sweeps
+_REACH = 1.0  # heights: further apart, two people's detections in one scan are not exchanged
+_IMPOSSIBLE, _TIE = -1e6, 1e-6
+"""Log likelihood of a pair that is out of reach; by how much another order must be better."""
 MAX_LOG_ODDS = 9.0  # e^9: no single measurement may decide by more
 AMBIGUOUS = 0.95
 """Association probability below which a frame's association is repeated with the others of its scan."""
@@ -109,51 +122,114 @@ def associate_jointly(
     evidence: of the frames, where it is known from before. manoeuvre: second hypothesis of ``prior``.
     """
     row = {number: i for i, number in enumerate(targets.initiation_number.tolist())}
-    before = []
+    columns = []
     for one in frames:
         column = np.full(len(targets), -1)
         for number, j in zip(one.ids.tolist(), one.column.tolist(), strict=True):
             if number in row:
                 column[row[number]] = j
-        before.append(column)
+        columns.append(column)
     found = list(evidence or ())
     if evidence is None:
         found = [
-            _evidence(one, targets, now_ns, up, colour_std, column) for one, column in zip(frames, before, strict=True)
+            _evidence(one, targets, now_ns, up, colour_std, column) for one, column in zip(frames, columns, strict=True)
         ]
+    attempts = _EXCHANGES if sweeps else 0
+    while True:
+        before = _information_of(prior, manoeuvre, found)
+        found = _swept(frames, targets, now_ns, up, colour_std, before, found, sweeps)
+        if attempts == 0:
+            break
+        attempts -= 1
+        order = _most_probable_order(frames, prior, manoeuvre, found, colour_std)
+        if np.array_equal(order, np.arange(len(targets))):
+            break
+        found = [each.of(order) for each in found]
+    ids = targets.initiation_number
+    hits = np.sum([each.column >= 0 for each in found], axis=0)
+    after = _combined(targets, *before, found)
+    return ScanResult(
+        replace(after, hits=targets.hits + hits - np.sum([column >= 0 for column in columns], axis=0)),
+        tuple(
+            replace(one, ids=ids[each.column >= 0], column=each.column[each.column >= 0], ambiguous=False)
+            for one, each in zip(frames, found, strict=True)
+        ),
+        tuple(found),
+        any(not np.array_equal(each.column, column) for each, column in zip(found, columns, strict=True)),
+        hits,
+    )
+
+
+def _information_of(
+    prior: Targets, manoeuvre: ManoeuvreHypothesis | None, found: list[FrameEvidence]
+) -> tuple[Floats, Floats, Floats]:
+    """Information (n, 7, 7) of targets before the scan, its vector (n, 7), and log odds (n,) of existence."""
+    covariance = prior.covariance
     if manoeuvre is not None:
         said = reduce(operator.add, found)
-        prior = replace(prior, covariance=widened_by_evidence(prior, manoeuvre, said.information, said.vector))
-    information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
-    vector = (information @ prior.mean[:, :, None])[:, :, 0]
-    odds = log_odds(prior.existence)
-    due = set(range(len(frames)))
+        covariance = widened_by_evidence(prior, manoeuvre, said.information, said.vector)
+    information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    return information, (information @ prior.mean[:, :, None])[:, :, 0], log_odds(prior.existence)
+
+
+def _swept(
+    frames: tuple[ScanFrame, ...],
+    targets: Targets,
+    now_ns: int,
+    up: Floats | None,
+    colour_std: float,
+    prior: tuple[Floats, Floats, Floats],
+    found: list[FrameEvidence],
+    sweeps: int,
+) -> list[FrameEvidence]:
+    """The frames' evidence after each was associated again given all others, until nothing changes."""
+    found, due = list(found), set(range(len(frames)))
     for _ in range(sweeps):
         for index, one in enumerate(frames):
             if index not in due:
                 continue
             due.discard(index)
-            others = [each for k, each in enumerate(found) if k != index]
-            without = _combined(targets, information, vector, odds, others)
+            without = _combined(targets, *prior, [each for k, each in enumerate(found) if k != index])
             new = _evidence(one, without, now_ns, up, colour_std, None)
             if not np.array_equal(new.column, found[index].column):
                 due |= set(range(len(frames))) - {index}
             found[index] = new
         if not due:
             break
-    ids = targets.initiation_number
-    hits = np.sum([each.column >= 0 for each in found], axis=0)
-    after = _combined(targets, information, vector, odds, found)
-    return ScanResult(
-        replace(after, hits=targets.hits + hits - np.sum([column >= 0 for column in before], axis=0)),
-        tuple(
-            replace(one, ids=ids[each.column >= 0], column=each.column[each.column >= 0], ambiguous=False)
-            for one, each in zip(frames, found, strict=True)
-        ),
-        tuple(found),
-        any(not np.array_equal(each.column, column) for each, column in zip(found, before, strict=True)),
-        hits,
-    )
+    return found
+
+
+def _most_probable_order(
+    frames: tuple[ScanFrame, ...],
+    prior: Targets,
+    manoeuvre: ManoeuvreHypothesis | None,
+    found: list[FrameEvidence],
+    colour_std: float,
+) -> Ints:
+    """Whose evidence (n,) each target gets, so that all together is most probable."""
+    n = len(prior)
+    said = reduce(operator.add, found)
+    detected = np.any([each.column >= 0 for each in found], axis=0)
+    off = np.linalg.norm(prior.mean[:, None, POSITION] - prior.mean[None, :, POSITION], axis=2)
+    reach = _REACH * np.exp(prior.mean[:, LOG_SIZE])
+    near = (off < reach[:, None]) & (prior.kind[:, None] == prior.kind[None, :]) & detected
+    a, b = np.nonzero(near & (near.sum(axis=0) > 1))  # whose detections nobody else can have made keep them
+    score = np.full((n, n), _IMPOSSIBLE)
+    score[:, ~detected] = 0.0
+    score[np.arange(n), np.arange(n)] = 0.0
+    if len(a) <= 1:
+        return np.arange(n)
+    measured = said.information[b], said.vector[b]
+    score[a, b] = log_evidence(prior.mean[a], prior.covariance[a], *measured)
+    if manoeuvre is not None:
+        changed = log_evidence(prior.mean[a], manoeuvre.covariance[a], *measured)
+        score[a, b] = log_mixture(manoeuvre.prior_odds[a], score[a, b], changed)
+    for one, each in zip(frames, found, strict=True):
+        if np.isfinite(one.frame.colour).any():
+            observed = np.where((each.column >= 0)[:, None], one.frame.colour[each.column], np.nan)[b]
+            score[a, b] += colour_score(observed, prior.colour[a], colour_std)
+    _, order = linear_sum_assignment(-score - _TIE * np.eye(n))
+    return np.asarray(order, dtype=np.int64)
 
 
 def _combined(

@@ -61,6 +61,12 @@ def manoeuvre_hypothesis(
     return ManoeuvreHypothesis(covariance, np.expm1(_MANOEUVRE_RATE[targets.kind] * np.abs(time)))
 
 
+def log_mixture(odds: Floats, smooth: Floats, changed: Floats) -> Floats:
+    """Log likelihoods (n,) of both hypotheses together. odds: (n,) prior odds of a change. smooth, changed: (n,)."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.logaddexp(smooth, changed + np.log(odds)) - np.log1p(odds))
+
+
 def within_reach(targets: Targets, elapsed: Floats, hypothesis: ManoeuvreHypothesis) -> ManoeuvreHypothesis:
     """The same without targets that could be anywhere by now. elapsed: (n,) since the last detection [s]."""
     near = _MANOEUVRE_STD[targets.kind] * elapsed <= np.sqrt(3.0) * _MAX_SPREAD_M
@@ -81,7 +87,7 @@ def widened_by_evidence(
     information: (n, 7, 7) of the measurements, and its vector (n, 7).
     """
     likelihoods = [
-        _log_evidence(predicted.mean, covariance, information, vector)
+        log_evidence(predicted.mean, covariance, information, vector)
         for covariance in (predicted.covariance, hypothesis.covariance)
     ]
     return _mixed(predicted.covariance, hypothesis, *likelihoods)
@@ -113,7 +119,7 @@ def _mixed(covariance: Floats, hypothesis: ManoeuvreHypothesis, smooth: Floats, 
     return np.asarray(covariance + weight[:, None, None] * (hypothesis.covariance - covariance))
 
 
-def _log_evidence(mean: Floats, covariance: Floats, information: Floats, vector: Floats) -> Floats:
+def log_evidence(mean: Floats, covariance: Floats, information: Floats, vector: Floats) -> Floats:
     """Log likelihood (n,) of measurements in information form, but for what does not depend on the prior."""
     prior = np.linalg.inv(covariance)
     total = prior + information

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,13 @@ from hypothesis import strategies as st
 from deploy.evaluation.clear_mot import EvaluationFrame, MotScores, clear_mot
 from hub.tracking import offline
 from hub.tracking.association.continuation import EntryExitRates
+from hub.tracking.association.initiation import LengthScale
+from hub.tracking.association.scan import associate_jointly
+from hub.tracking.detections import TrackingCamera, frame_detections
 from hub.tracking.filter.detection_model import posterior_existence
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.target_states import MultiTargetState
+from hub.tracking.frame_update import predict_targets, process_frame
 from hub.tracking.offline import FollowResult, follow
 from hub.tracking.parameters import TrackerParameters
 from hub.tracking.smoothing import BatchSmoother
@@ -217,6 +222,28 @@ def test_what_lies_between_two_exchanged_tracks_is_associated_anew(monkeypatch: 
     assert after[4:7] == [[[]] * 4] * 3
     assert after[7:] == [[[1 - row for row in ids] for ids in scan] for scan in before[7:]]
     assert smoother._changed[4:7].all()
+
+
+def test_an_exchange_on_which_all_cameras_of_a_scan_agree_is_undone_as_a_whole() -> None:
+    """Two walk side by side at 2 Hz; in the last scan every camera has taken each for the other."""
+    rng = np.random.default_rng(0)
+    place = np.array([[-0.4, 0.0], [0.4, 0.0]]) + 0.5 * np.arange(8)[:, None, None] * np.array([0.0, 1.0])
+    messages, calibration = boxes(rng, place - [0.0, 1.75], cameras=4, height=3.0)
+    cameras = {name: TrackingCamera.from_calibration(camera) for name, camera in calibration.cameras.items()}
+    parameters = TrackerParameters(up=UP, scale=LengthScale(1.0, True))
+    state = MultiTargetState.empty()
+    for frame in sorted((frame_detections(cameras[one.camera], one) for one in messages), key=lambda one: one.key):
+        state = process_frame(state, frame, cameras, parameters)
+    scan, now, targets = state.scan, state.time_ns, state.targets
+    assert scan is not None
+    assert now is not None
+    first, second = targets.initiation_number.tolist()
+    wrong = tuple(replace(one, ids=first + second - one.ids) for one in scan.frames)
+    there = replace(targets, mean=targets.mean[::-1], covariance=targets.covariance[::-1])
+    prior = predict_targets(scan.prior, 0.5, parameters)
+    found = associate_jointly(wrong, there, now, prior, UP, 28.0)
+    for one, other in zip(found.frames, scan.frames, strict=True):
+        assert dict(zip(one.ids, one.column, strict=True)) == dict(zip(other.ids, other.column, strict=True))
 
 
 def test_people_come_and_go_at_doors() -> None:
