@@ -81,10 +81,8 @@ def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[LensTest]:
         return []
     wide = replace(problem.free_parameters, lens=True, focal_std=_WIDE_FOCAL_STD, k1_std=_WIDE_K1_STD)
     freed = replace(problem, free_parameters=wide)
-    inflation = [
-        max(correlation_inflation(problem, state, camera), modelled_inflation(problem, state, camera))
-        for camera in cameras
-    ]
+    modelled = [modelled_inflation(problem, state, camera) for camera in cameras]
+    inflation = np.maximum(correlation_inflation(problem, state), modelled)
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
     columns, normal, gradient = _reduced_system(freed, noisy, estimate_smoothness(problem, state))
     lens = {
@@ -118,7 +116,7 @@ def with_crystal_rates(problem: Problem, state: AdjustmentState) -> Problem:
     if not problem.free_parameters.clock:
         return problem
     wide = replace(problem, crystal_rates=())
-    inflation = [correlation_inflation(problem, state, camera) for camera in range(len(state.cameras))]
+    inflation = correlation_inflation(problem, state)
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
     columns, normal, gradient = _reduced_system(wide, noisy, estimate_smoothness(problem, state))
     covariance = _reduction(normal, gradient, gauge_tangent(wide, state), np.arange(len(columns)))[2]
@@ -152,7 +150,7 @@ def are_readouts_observable(problem: Problem, state: AdjustmentState, prior: Smo
     # Scaling by the effective sample size only lowers the gain, and usually there is none: test the cheap bound first.
     if _cost_reduction(freed_problem, state, prior, readout_columns) < bic_penalty:
         return False
-    inflation = np.array([correlation_inflation(problem, state, camera) for camera in range(len(state.cameras))])
+    inflation = correlation_inflation(problem, state)
     return (
         _cost_reduction(freed_problem, replace(state, sigma=state.sigma * np.sqrt(inflation)), prior, readout_columns)
         > bic_penalty
@@ -222,7 +220,7 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     are score tests at the same solution, so that they compete on equal terms.
     """
     cameras = range(len(state.cameras))
-    inflation = np.array([correlation_inflation(problem, state, camera) for camera in cameras])
+    inflation = correlation_inflation(problem, state)
     if not problem.free_parameters.clock or inflation.max() < _MIN_STEP_INFLATION:
         return None
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
@@ -243,12 +241,14 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     width = 0.9 * float(np.ptp(times)) / (_STEP_TIMES - 1)
     near = np.linspace(max(best.time - width, times.min()), min(best.time + width, times.max()), _STEP_TIMES)
     best = _best_step(problem, noisy, common, best.camera, near)
+    rows = sum(int(part.use.sum()) for part in problem.rows)
+    needed = 2.0 * np.log(max(rows, 2)) + 2.0 * np.log(_STEP_TIMES * len(state.cameras))
+    if best.statistic <= needed or abs(best.size) <= _MIN_STEP_S:
+        return None
     freed = with_free_readouts(problem)
     of_readouts = freed.free_columns() % CAMERA_PARAMETERS == READOUT
     readout = _cost_reduction(freed, noisy, prior, of_readouts) if of_readouts.any() else 0.0
-    rows = sum(int(part.use.sum()) for part in problem.rows)
-    needed = 2.0 * np.log(max(rows, 2)) + 2.0 * np.log(_STEP_TIMES * len(state.cameras))
-    return best if best.statistic > needed and best.statistic > readout and abs(best.size) > _MIN_STEP_S else None
+    return best if best.statistic > readout else None
 
 
 def with_clock_step(problem: Problem, step: ClockStep, middle: float) -> Problem:

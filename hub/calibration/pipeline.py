@@ -585,11 +585,10 @@ def _bic_prefers(
 
     It uses the robust likelihood of all rows under each solution's own noise, at the effective sample size.
     """
-    cameras = range(len(fixed_state.cameras))
-    inflation = np.array([correlation_inflation(freed, freed_state, camera) for camera in cameras])
+    inflation = correlation_inflation(freed, freed_state)
     rows = sum(len(part.time) / inflation[part.camera] for part in fixed.rows)
     gain = float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / inflation).sum())
-    return bool(gain > parameters * len(cameras) * np.log(max(rows, 2)))
+    return bool(gain > parameters * len(fixed_state.cameras) * np.log(max(rows, 2)))
 
 
 def _deviances(problem: Problem, state: AdjustmentState) -> Floats:
