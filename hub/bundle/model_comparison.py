@@ -46,6 +46,8 @@ _STEP_TIMES, _MIN_STEP_ROWS = 24, 60
 """Times at which a clock step is tried, and rows of a camera below which none is."""
 _MIN_STEP_S = 5e-3
 """Smallest clock step [s] that is reported: less is jitter or a wandering clock."""
+_MAX_STEP_S = 0.2
+"""Largest clock step [s] that is looked for among rejected rows: larger ones show in the stamps."""
 _MIN_STEP_INFLATION = 4.0
 """Rows per effective row below which no residuals are correlated, as a step's would be."""
 REFUTED_SIGMA = 4.0
@@ -249,6 +251,28 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     of_readouts = freed.free_columns() % CAMERA_PARAMETERS == READOUT
     readout = _cost_reduction(freed, noisy, prior, of_readouts) if of_readouts.any() else 0.0
     return best if best.statistic > readout else None
+
+
+def remaining_step(problem: Problem, state: AdjustmentState, camera: int, time: float) -> ClockStep:
+    """What one Gauss-Newton step adds to a corrected clock step at camera time ``time``, with its std."""
+    noisy = replace(state, sigma=state.sigma * np.sqrt(correlation_inflation(problem, state)))
+    common = _common_terms(problem, noisy, estimate_smoothness(problem, state))
+    return _best_step(problem, noisy, common, camera, np.array([time]))
+
+
+def with_rows_of_a_step(problem: Problem, state: AdjustmentState) -> Problem:
+    """The problem with all rows in use whose residuals a step of at most `_MAX_STEP_S` could explain.
+
+    A state that is adjusted robustly to many rows rejects the few after a step as outliers.
+    """
+    paths, rows = StackedTrajectories.of(state.trajectories), []
+    for part in problem.rows:
+        camera, every = state.cameras[part.camera], part.using(np.ones_like(part.use))
+        seen = evaluate_labels([every], camera, paths)
+        speed = np.linalg.norm(jacobians(seen, camera, [OFFSET])[:, 3], axis=0)
+        reach = _MAX_STEP_S * speed
+        rows.append(part.using(part.use | (seen.valid & (np.linalg.norm(seen.residual, axis=0) < reach))))
+    return replace(problem, rows=tuple(rows))
 
 
 def with_clock_step(problem: Problem, step: ClockStep, middle: float) -> Problem:
