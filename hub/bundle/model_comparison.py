@@ -215,11 +215,12 @@ def _reduction(normal: Floats, gradient: Floats, tangent: Floats | None, kept: I
     return float(-gradient @ step), step, covariance
 
 
-def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | None:
+def find_clock_step(problem: Problem, state: AdjustmentState, against_lenses: bool = False) -> ClockStep | None:
     """The clock step that would lower the cost most, if it explains more than any readout; None where none is needed.
 
     problem, state: adjusted without one. A step inside the recording looks like a rolling shutter of all cameras: both
-    are score tests at the same solution, so that they compete on equal terms.
+    are score tests at the same solution, so that they compete on equal terms. against_lenses: it also has to explain
+    more than any measured lens that is wrong, whose slow errors look like steps in a part of a recording.
     """
     cameras = range(len(state.cameras))
     inflation = correlation_inflation(problem, state)
@@ -250,7 +251,10 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     freed = with_free_readouts(problem)
     of_readouts = freed.free_columns() % CAMERA_PARAMETERS == READOUT
     readout = _cost_reduction(freed, noisy, prior, of_readouts) if of_readouts.any() else 0.0
-    return best if best.statistic > readout else None
+    if best.statistic <= readout:
+        return None
+    lenses = refuted_lenses(problem, state) if against_lenses else []
+    return best if all(lens.statistic < best.statistic for lens in lenses) else None
 
 
 def remaining_step(problem: Problem, state: AdjustmentState, camera: int, time: float) -> ClockStep:

@@ -210,7 +210,8 @@ def _clock_step(
     First one that is not known; then what is left of a known one, where that is more than its std.
     """
     problem, state = reconstruction.problem, reconstruction.state
-    found, new = model_comparison.find_clock_step(model_comparison.with_rows_of_a_step(problem, state), state), 1
+    tested = model_comparison.with_rows_of_a_step(problem, state)
+    found, new = model_comparison.find_clock_step(tested, state, against_lenses=True), 1
     for name in () if found is not None else [name for name in reconstruction.names if name in steps]:
         scale, origin = prepared.time_scale(name), prepared.time_origins[name]
         for step in steps[name]:

@@ -468,9 +468,11 @@ def in_rig_order(refused: dict[str, str], prepared: PreparedSession) -> dict[str
     return {name: refused[name] for name in prepared.camera_order if name in refused}
 
 
-def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+def _with_clock_steps(
+    problem: Problem, state: AdjustmentState, against_lenses: bool
+) -> tuple[Problem, AdjustmentState]:
     """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
-    step = model_comparison.find_clock_step(problem, state)
+    step = model_comparison.find_clock_step(problem, state, against_lenses)
     for _ in range(MAX_CLOCK_STEPS):
         if step is None:
             break
@@ -479,7 +481,7 @@ def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem
             trial, trial_state, _ = adjust(
                 model_comparison.with_clock_step(problem, step, middle), trial_state, rounds=2
             )
-            more = model_comparison.find_clock_step(trial, trial_state)
+            more = model_comparison.find_clock_step(trial, trial_state, against_lenses)
             if more is None or more.camera != step.camera or abs(more.time - step.time) > SAME_STEP_S or not left:
                 break
             # The size is of one Gauss-Newton step, which leaves a part of a large one.
@@ -520,7 +522,7 @@ def final_adjustment(
             return reconstruction  # the camera will be left out
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     if not (warm and online):
-        problem, state = _with_clock_steps(problem, state)
+        problem, state = _with_clock_steps(problem, state, against_lenses=online)
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
     problem = model_comparison.with_crystal_rates(problem, state)
     if refine_lenses and not warm:
