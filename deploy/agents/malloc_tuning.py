@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's mallopt
 _MAX_ARENAS = 2  # glibc would make eight a core
 _LARGE_BLOCK_BYTES = 128 * 1024  # glibc's own initial threshold, here kept from growing
 _MAX_MMAP_THRESHOLD_BYTES = 32 * 1024 * 1024  # glibc's upper limit
+_OBJECTS_PER_COLLECTION = 100_000  # instead of Python's 700
 _NEVER_TRIM_BYTES = 1024**3  # more than any command frees
 
 
@@ -38,8 +40,10 @@ def retain_freed_memory() -> bool:
     """Keep freed memory in the heap for reuse, in a process that ends soon. False if the C library has no mallopt.
 
     Solvers allocate and free the same arrays of some 100 kB repeatedly. If each is requested from the system again,
-    every 4 KiB cause a page fault and are zeroed, which took a fifth of the run time of `calibrate`.
+    every 4 KiB cause a page fault and are zeroed, which took a fifth of the run time of `calibrate`. Python's search
+    for reference cycles, of which imports and solvers make few, takes another thirtieth.
     """
+    gc.set_threshold(_OBJECTS_PER_COLLECTION)
     try:
         set_option = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # musl, macOS

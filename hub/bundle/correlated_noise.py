@@ -72,8 +72,7 @@ def refit_with_correlated_noise(
     excluded = state.jitter is not None or not problem.free_parameters.clock or not problem.free_parameters.pose
     if excluded or any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return problem, state
-    cameras = range(len(state.cameras))
-    if max(correlation_inflation(problem, state, camera) for camera in cameras) < min_inflation:
+    if correlation_inflation(problem, state).max() < min_inflation:
         return problem, state
     noise_model = estimate_correlated_noise(problem, state)
     if not is_tractable(problem, noise_model):

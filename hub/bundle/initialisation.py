@@ -327,7 +327,7 @@ def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: R
             continue
         time = clock.reference_time(track.time)
         where = path.at(time)
-        both = np.isfinite(where).all(axis=1) & seen_by_two(reconstruction, number, time)
+        both = np.isfinite(where).all(axis=1) & seen_by_two(observation_times(reconstruction, number), time)
         positions.append(where[both])
         seen.append(track.points[both])
     if not positions:
@@ -335,14 +335,20 @@ def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: R
     return np.concatenate(positions), np.concatenate(seen)
 
 
-def seen_by_two(reconstruction: Reconstruction, number: int, time: Floats) -> Bools:
-    """Times (n,) within 0.2 s of observations of at least two placed cameras."""
-    count = np.zeros(len(time), dtype=np.int64)
+def observation_times(reconstruction: Reconstruction, number: int) -> list[Floats]:
+    """Sorted internal times at which a label is observed, by placed camera that observes it."""
+    out = []
     for camera, state in enumerate(reconstruction.state.cameras):
         seen = [r.time[r.use] for r in reconstruction.problem.rows if r.camera == camera and r.label == number]
-        if not seen or not len(seen[0]):
-            continue
-        reference = np.sort(state.reference_time(np.concatenate(seen)))
+        if seen and len(seen[0]):
+            out.append(np.sort(state.reference_time(np.concatenate(seen))))
+    return out
+
+
+def seen_by_two(observed: list[Floats], time: Floats) -> Bools:
+    """Times (n,) within 0.2 s of observations of at least two placed cameras. observed: of `observation_times`."""
+    count = np.zeros(len(time), dtype=np.int64)
+    for reference in observed:
         after = np.clip(np.searchsorted(reference, time), 1, len(reference) - 1)
         nearest = np.minimum(np.abs(reference[after] - time), np.abs(reference[after - 1] - time))
         count += nearest < 0.2

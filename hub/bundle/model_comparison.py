@@ -46,6 +46,8 @@ _STEP_TIMES, _MIN_STEP_ROWS = 24, 60
 """Times at which a clock step is tried, and rows of a camera below which none is."""
 _MIN_STEP_S = 5e-3
 """Smallest clock step [s] that is reported: less is jitter or a wandering clock."""
+_MAX_STEP_S = 0.2
+"""Largest clock step [s] that is looked for among rejected rows: larger ones show in the stamps."""
 _MIN_STEP_INFLATION = 4.0
 """Rows per effective row below which no residuals are correlated, as a step's would be."""
 REFUTED_SIGMA = 4.0
@@ -81,10 +83,8 @@ def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[LensTest]:
         return []
     wide = replace(problem.free_parameters, lens=True, focal_std=_WIDE_FOCAL_STD, k1_std=_WIDE_K1_STD)
     freed = replace(problem, free_parameters=wide)
-    inflation = [
-        max(correlation_inflation(problem, state, camera), modelled_inflation(problem, state, camera))
-        for camera in cameras
-    ]
+    modelled = [modelled_inflation(problem, state, camera) for camera in cameras]
+    inflation = np.maximum(correlation_inflation(problem, state), modelled)
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
     columns, normal, gradient = _reduced_system(freed, noisy, estimate_smoothness(problem, state))
     lens = {
@@ -118,7 +118,7 @@ def with_crystal_rates(problem: Problem, state: AdjustmentState) -> Problem:
     if not problem.free_parameters.clock:
         return problem
     wide = replace(problem, crystal_rates=())
-    inflation = [correlation_inflation(problem, state, camera) for camera in range(len(state.cameras))]
+    inflation = correlation_inflation(problem, state)
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
     columns, normal, gradient = _reduced_system(wide, noisy, estimate_smoothness(problem, state))
     covariance = _reduction(normal, gradient, gauge_tangent(wide, state), np.arange(len(columns)))[2]
@@ -152,7 +152,7 @@ def are_readouts_observable(problem: Problem, state: AdjustmentState, prior: Smo
     # Scaling by the effective sample size only lowers the gain, and usually there is none: test the cheap bound first.
     if _cost_reduction(freed_problem, state, prior, readout_columns) < bic_penalty:
         return False
-    inflation = np.array([correlation_inflation(problem, state, camera) for camera in range(len(state.cameras))])
+    inflation = correlation_inflation(problem, state)
     return (
         _cost_reduction(freed_problem, replace(state, sigma=state.sigma * np.sqrt(inflation)), prior, readout_columns)
         > bic_penalty
@@ -215,14 +215,15 @@ def _reduction(normal: Floats, gradient: Floats, tangent: Floats | None, kept: I
     return float(-gradient @ step), step, covariance
 
 
-def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | None:
+def find_clock_step(problem: Problem, state: AdjustmentState, against_lenses: bool = False) -> ClockStep | None:
     """The clock step that would lower the cost most, if it explains more than any readout; None where none is needed.
 
     problem, state: adjusted without one. A step inside the recording looks like a rolling shutter of all cameras: both
-    are score tests at the same solution, so that they compete on equal terms.
+    are score tests at the same solution, so that they compete on equal terms. against_lenses: it also has to explain
+    more than any measured lens that is wrong, whose slow errors look like steps in a part of a recording.
     """
     cameras = range(len(state.cameras))
-    inflation = np.array([correlation_inflation(problem, state, camera) for camera in cameras])
+    inflation = correlation_inflation(problem, state)
     if not problem.free_parameters.clock or inflation.max() < _MIN_STEP_INFLATION:
         return None
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
@@ -243,12 +244,39 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     width = 0.9 * float(np.ptp(times)) / (_STEP_TIMES - 1)
     near = np.linspace(max(best.time - width, times.min()), min(best.time + width, times.max()), _STEP_TIMES)
     best = _best_step(problem, noisy, common, best.camera, near)
+    rows = sum(int(part.use.sum()) for part in problem.rows)
+    needed = 2.0 * np.log(max(rows, 2)) + 2.0 * np.log(_STEP_TIMES * len(state.cameras))
+    if best.statistic <= needed or abs(best.size) <= _MIN_STEP_S:
+        return None
     freed = with_free_readouts(problem)
     of_readouts = freed.free_columns() % CAMERA_PARAMETERS == READOUT
     readout = _cost_reduction(freed, noisy, prior, of_readouts) if of_readouts.any() else 0.0
-    rows = sum(int(part.use.sum()) for part in problem.rows)
-    needed = 2.0 * np.log(max(rows, 2)) + 2.0 * np.log(_STEP_TIMES * len(state.cameras))
-    return best if best.statistic > needed and best.statistic > readout and abs(best.size) > _MIN_STEP_S else None
+    if best.statistic <= readout:
+        return None
+    lenses = refuted_lenses(problem, state) if against_lenses else []
+    return best if all(lens.statistic < best.statistic for lens in lenses) else None
+
+
+def remaining_step(problem: Problem, state: AdjustmentState, camera: int, time: float) -> ClockStep:
+    """What one Gauss-Newton step adds to a corrected clock step at camera time ``time``, with its std."""
+    noisy = replace(state, sigma=state.sigma * np.sqrt(correlation_inflation(problem, state)))
+    common = _common_terms(problem, noisy, estimate_smoothness(problem, state))
+    return _best_step(problem, noisy, common, camera, np.array([time]))
+
+
+def with_rows_of_a_step(problem: Problem, state: AdjustmentState) -> Problem:
+    """The problem with all rows in use whose residuals a step of at most `_MAX_STEP_S` could explain.
+
+    A state that is adjusted robustly to many rows rejects the few after a step as outliers.
+    """
+    paths, rows = StackedTrajectories.of(state.trajectories), []
+    for part in problem.rows:
+        camera, every = state.cameras[part.camera], part.using(np.ones_like(part.use))
+        seen = evaluate_labels([every], camera, paths)
+        speed = np.linalg.norm(jacobians(seen, camera, [OFFSET])[:, 3], axis=0)
+        reach = _MAX_STEP_S * speed
+        rows.append(part.using(part.use | (seen.valid & (np.linalg.norm(seen.residual, axis=0) < reach))))
+    return replace(problem, rows=tuple(rows))
 
 
 def with_clock_step(problem: Problem, step: ClockStep, middle: float) -> Problem:

@@ -8,6 +8,7 @@ than the number of residuals.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -46,10 +47,9 @@ def rescale_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPri
     for rows in problem.rows:
         residual_count[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
         fitted_parameters[rows.camera] += _hat_matrix_trace(problem, state, found, rows)
+    observed = correlation_inflation(problem, state)
     for camera in range(len(state.cameras)):
-        inflation[camera] = max(
-            correlation_inflation(problem, state, camera), modelled_inflation(problem, state, camera)
-        )
+        inflation[camera] = max(observed[camera], modelled_inflation(problem, state, camera))
     redundancy = np.maximum(1.0 - fitted_parameters / np.maximum(residual_count, 1.0), _MIN_REDUNDANCY)
     return replace(state, sigma=state.sigma * np.sqrt(inflation / redundancy))
 
@@ -96,12 +96,19 @@ def modelled_inflation(problem: Problem, state: AdjustmentState, camera: int) ->
     return 1.0 + 2.0 * correlated / (white + correlated) * correlation / max(1.0 - correlation, 1e-6)
 
 
-def correlation_inflation(problem: Problem, state: AdjustmentState, camera: int) -> float:
-    """Rows per effective row (n / effective n) of a camera: serial inflation times inflation within a frame.
+@lru_cache(maxsize=2)  # every test of a solution needs it
+def correlation_inflation(problem: Problem, state: AdjustmentState) -> Floats:
+    """(cameras,) rows per effective row (n / effective n): serial inflation times inflation within a frame.
 
     1 + 2 sum of the autocorrelations over frames, and 1 + (labels - 1) times the correlation within a frame, as far as
-    these are significant.
+    these are significant. Read-only.
     """
+    inflation = np.array([_inflation_of(problem, state, camera) for camera in range(len(state.cameras))])
+    inflation.flags.writeable = False
+    return inflation
+
+
+def _inflation_of(problem: Problem, state: AdjustmentState, camera: int) -> float:
     parts: list[tuple[Floats, Floats]] = []
     for rows in problem.rows:
         if rows.camera != camera or np.count_nonzero(rows.use) < 8:

@@ -85,10 +85,10 @@ def wrong_lens(problem: Problem, state: AdjustmentState) -> LensTest | None:
     It need not be the most significant one: the others' residuals, which are small, show what it does to them. Without
     correlated residuals there is none: a wrong lens displaces successive rows alike.
     """
-    cameras = range(len(state.cameras))
-    if state.correlated_noise is not None or not problem.free_parameters.clock or len(cameras) < _MIN_TO_BLAME_A_LENS:
+    too_few = len(state.cameras) < _MIN_TO_BLAME_A_LENS
+    if state.correlated_noise is not None or not problem.free_parameters.clock or too_few:
         return None
-    if max(correlation_inflation(problem, state, camera) for camera in cameras) < MIN_INFLATION:
+    if correlation_inflation(problem, state).max() < MIN_INFLATION:
         return None
     worst = max(refuted_lenses(problem, state), key=_excess, default=None)
     return None if worst is None or _excess(worst) <= _WRONG_LENS else worst

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hub.bundle import model_comparison
 from hub.bundle.adjustment import residual_norms
 from hub.bundle.initialisation import (
     Reconstruction,
@@ -27,13 +28,23 @@ from hub.bundle.problem import CameraState, FreeParameters
 from hub.calibration.acceptance import least_certain_camera, misfits
 from hub.calibration.pair_network import expected_lag, solve_new_pairs
 from hub.calibration.pair_overlap import LARGE_NETWORK
-from hub.calibration.pipeline import calibrate, final_adjustment
+from hub.calibration.pipeline import MAX_CLOCK_STEPS, bic_prefers, calibrate, final_adjustment
 from hub.calibration.resection_scan import scan_resection
 from hub.calibration.result import assemble_calibration
 from hub.calibration.self_calibration import focal_prior, with_cameras, with_lens
 from hub.calibration.solution import Solution
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from hub.clocks.external_prior import ExternalClockPrior
+from hub.clocks.step_correction import (
+    Step,
+    on_newest_clock,
+    on_newest_side,
+    shown_since,
+    steps_inside,
+    with_clock_set,
+    with_step,
+    with_step_stds,
+)
 from hub.sync.hypothesis import PairSolution, evidence
 from protocols.core.clocks import CameraTime, TimeMap
 from protocols.core.errors import Refused
@@ -48,6 +59,7 @@ _MIN_RECENT_ROWS = 30  # before and after a move: as many as a camera of a netwo
 _MOVED_SHARE, _STEADY_SHARE = 0.4, 0.8
 """A camera was moved where fewer of its newest rows than the first fit, while more of its older ones than the second
 do: of a camera that stands still 90 % and more fit."""
+_BETTER_KNOWN = 0.7  # a clock step is refined where its std falls below this share: twice the rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,13 +98,13 @@ def update_calibration(
             online=True,
             refine_lenses=refine_lenses,
         )
+        found = with_step_stds(on_newest_side(found))
         return Update(found if last is None else _in_published_clock(found, last), {})
     if last.reference in rig.cameras:
         rig = replace(rig, metadata={**rig.metadata, "reference": last.reference})
-    prepared = _with_estimated_lenses(rig, prepare(rig, observations), last)
+    observations, last, start, steps = _with_clock_steps(rig, observations, last, full)
+    prepared, reconstruction = start
     refused = dict(prepared.refused)
-    tied = [name for name in prepared.cameras if name in last.cameras]
-    reconstruction = _warm_start(prepared, _initial_states(prepared, last, tied, measured_lenses=full))
     moved = _moved_cameras(reconstruction, prepared)
     origins = prepared.time_origins
     if moved:
@@ -150,11 +162,77 @@ def update_calibration(
         prepared,
         "joint",
     )
-    found = _in_published_clock(assemble_calibration(rig, solution, last), last)
+    found = _with_steps(on_newest_side(assemble_calibration(rig, solution, last)), steps)
+    found = _in_published_clock(found, last)
     # Cameras of which the present rows say too little stay as they were: world and clock are the same.
     kept = {name: camera for name, camera in last.cameras.items() if name not in found.cameras and name not in refuted}
     refused = {name: reason for name, reason in found.refused.items() if name not in kept}
     return Update(replace(found, cameras=found.cameras | kept, refused=refused), moved)
+
+
+def _with_clock_steps(
+    rig: Rig, observations: Observations, last: Calibration, full: bool
+) -> tuple[Observations, Calibration, tuple[PreparedSession, Reconstruction], dict[str, tuple[Step, ...]]]:
+    """Observations on the newest side of all clock steps, the last answer on it, the start from both, and the steps.
+
+    Steps that are known are corrected; a further one is, where that explains the rows better. It comes before the
+    question whether a camera was moved: a clock that steps has one parameter, a pose six.
+    """
+    steps = steps_inside(last, observations)
+
+    def start(steps: dict[str, tuple[Step, ...]], last: Calibration) -> tuple[PreparedSession, Reconstruction]:
+        prepared = _with_estimated_lenses(rig, prepare(rig, on_newest_clock(observations, steps)), last)
+        tied = [name for name in prepared.cameras if name in last.cameras]
+        return prepared, _warm_start(prepared, _initial_states(prepared, last, tied, measured_lenses=full))
+
+    prepared, reconstruction = start(steps, last)
+    for _ in range(MAX_CLOCK_STEPS + 1):
+        found = _clock_step(reconstruction, prepared, steps)
+        if found is None:
+            break
+        name, step, parameters = found
+        trial_steps, trial_last = with_step(steps, name, step), with_clock_set(last, name, step[1])
+        trial = start(trial_steps, trial_last)
+        before, after = reconstruction, trial[1]
+        if before.names != after.names or not bic_prefers(
+            after.problem, after.state, before.problem, before.state, parameters
+        ):
+            break
+        steps, last, (prepared, reconstruction) = trial_steps, trial_last, trial
+    return on_newest_clock(observations, steps), last, (prepared, reconstruction), steps
+
+
+def _clock_step(
+    reconstruction: Reconstruction, prepared: PreparedSession, steps: Mapping[str, tuple[Step, ...]]
+) -> tuple[str, Step, int] | None:
+    """A camera's clock step that its rows show, on the corrected clock, and its number of new parameters.
+
+    First one that is not known; then what is left of a known one, where that is more than its std.
+    """
+    problem, state = reconstruction.problem, reconstruction.state
+    tested = model_comparison.with_rows_of_a_step(problem, state)
+    found, new = model_comparison.find_clock_step(tested, state, against_lenses=True), 1
+    for name in () if found is not None else [name for name in reconstruction.names if name in steps]:
+        scale, origin = prepared.time_scale(name), prepared.time_origins[name]
+        for step in steps[name]:
+            at = scale * (shown_since(steps, name, step) - origin)
+            left = model_comparison.remaining_step(problem, state, reconstruction.names.index(name), at)
+            if abs(left.size) > left.std or left.std < _BETTER_KNOWN * scale * step[2]:
+                found, new = left, 0
+    if found is None:
+        return None
+    name = reconstruction.names[found.camera]
+    scale = prepared.time_scale(name)
+    return name, (found.time / scale + prepared.time_origins[name], found.size / scale, found.std / scale), new
+
+
+def _with_steps(found: Calibration, steps: Mapping[str, tuple[Step, ...]]) -> Calibration:
+    """The calibration with the steps that were corrected before it was adjusted."""
+    cameras = {
+        name: replace(camera, clock_steps=(*steps.get(name, ()), *camera.clock_steps))
+        for name, camera in found.cameras.items()
+    }
+    return with_step_stds(replace(found, cameras=cameras) if steps else found)
 
 
 def _adjust_without_failures(

@@ -42,6 +42,7 @@ from hub.calibration.solution import Solution
 from hub.calibration.unconnected import connect_by_resection
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
 from hub.clocks.external_prior import ExternalClockPrior
+from hub.clocks.step_correction import SAME_STEP_S
 from hub.sync.hypothesis import PairSolution
 from hub.trajectory.image_tracks import smooth_only
 from hub.two_view.relative_pose import fundamental_from
@@ -57,8 +58,7 @@ if TYPE_CHECKING:
 
 _LENS_ITERATIONS = 3  # a bound: it stops where no lens changes
 _SMALL_BODY = 4  # points of a single tag
-_MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2  # steps of all clocks in one recording; Gauss-Newton steps for each
-_SAME_STEP_S = 2.0  # s: closer than this it is the same step
+MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2  # steps of all clocks in one recording; Gauss-Newton steps for each
 _ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
 _MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 
@@ -468,10 +468,12 @@ def in_rig_order(refused: dict[str, str], prepared: PreparedSession) -> dict[str
     return {name: refused[name] for name in prepared.camera_order if name in refused}
 
 
-def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+def _with_clock_steps(
+    problem: Problem, state: AdjustmentState, against_lenses: bool
+) -> tuple[Problem, AdjustmentState]:
     """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
-    step = model_comparison.find_clock_step(problem, state)
-    for _ in range(_MAX_CLOCK_STEPS):
+    step = model_comparison.find_clock_step(problem, state, against_lenses)
+    for _ in range(MAX_CLOCK_STEPS):
         if step is None:
             break
         middle, trial_state = state.cameras[step.camera].centre, state
@@ -479,12 +481,12 @@ def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem
             trial, trial_state, _ = adjust(
                 model_comparison.with_clock_step(problem, step, middle), trial_state, rounds=2
             )
-            more = model_comparison.find_clock_step(trial, trial_state)
-            if more is None or more.camera != step.camera or abs(more.time - step.time) > _SAME_STEP_S or not left:
+            more = model_comparison.find_clock_step(trial, trial_state, against_lenses)
+            if more is None or more.camera != step.camera or abs(more.time - step.time) > SAME_STEP_S or not left:
                 break
             # The size is of one Gauss-Newton step, which leaves a part of a large one.
             step = replace(step, size=step.size + more.size)
-        if not _bic_prefers(trial, trial_state, problem, state):
+        if not bic_prefers(trial, trial_state, problem, state):
             break
         problem, state, step = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step)), more
     return problem, state
@@ -519,15 +521,15 @@ def final_adjustment(
         if lens is not None and (step is None or step.statistic < lens.statistic):
             return reconstruction  # the camera will be left out
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
-    if not online:
-        problem, state = _with_clock_steps(problem, state)
+    if not (warm and online):
+        problem, state = _with_clock_steps(problem, state, against_lenses=online)
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
     problem = model_comparison.with_crystal_rates(problem, state)
     if refine_lenses and not warm:
         report("adjusting the lenses", 0.85)
         freed = replace(problem, free_parameters=replace(problem.free_parameters, lens=True))
         freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: report(text, 0.85))
-        if _bic_prefers(freed_problem, freed_state, problem, state):
+        if bic_prefers(freed_problem, freed_state, problem, state):
             problem, state = freed_problem, freed_state
     if (
         not online
@@ -541,7 +543,7 @@ def final_adjustment(
         ):
             held = model_comparison.without_negative_readouts(read_problem, read_state)
             read_problem, read_state, _ = adjust(*held, rounds=2)
-        if model_comparison.are_readouts_plausible(read_problem, read_state) and _bic_prefers(
+        if model_comparison.are_readouts_plausible(read_problem, read_state) and bic_prefers(
             read_problem, read_state, problem, state, 1
         ):
             problem, state = read_problem, read_state
@@ -578,18 +580,17 @@ def _with_state(reconstruction: Reconstruction, problem: Problem, state: Adjustm
     return Reconstruction(reconstruction.names, reconstruction.labels, problem, state)
 
 
-def _bic_prefers(
+def bic_prefers(
     freed: Problem, freed_state: AdjustmentState, fixed: Problem, fixed_state: AdjustmentState, parameters: int = 2
 ) -> bool:
     """Whether ``parameters`` more per camera (focal length and k1) are justified (Bayesian information criterion).
 
     It uses the robust likelihood of all rows under each solution's own noise, at the effective sample size.
     """
-    cameras = range(len(fixed_state.cameras))
-    inflation = np.array([correlation_inflation(freed, freed_state, camera) for camera in cameras])
+    inflation = correlation_inflation(freed, freed_state)
     rows = sum(len(part.time) / inflation[part.camera] for part in fixed.rows)
     gain = float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / inflation).sum())
-    return bool(gain > parameters * len(cameras) * np.log(max(rows, 2)))
+    return bool(gain > parameters * len(fixed_state.cameras) * np.log(max(rows, 2)))
 
 
 def _deviances(problem: Problem, state: AdjustmentState) -> Floats:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.fft import irfft, rfft
 
-from hub.bundle.initialisation import CameraInput, Reconstruction, seen_by_two
-from hub.bundle.problem import CameraState
+from hub.bundle.initialisation import CameraInput, Reconstruction, observation_times, seen_by_two
+from hub.bundle.problem import CameraState, Trajectory
 from hub.clocks.clock_graph import TimeMapEstimate
 from hub.sync.lag_scan import fast_length, grid_tracks
 from hub.trajectory.image_tracks import ImageTrack, SmoothTrack
@@ -135,6 +136,23 @@ class TimeMapCandidate:
     support: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _SeenLabel:
+    """A label of the camera: its track, the path that the others give, and their times of it by camera."""
+
+    track: SmoothTrack
+    path: Trajectory
+    observed: list[Floats]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PathMoments:
+    """The paths on a grid from internal time ``begin``: products (10, labels, times) of the homogeneous points."""
+
+    begin: float
+    products: Floats
+
+
 def find_time_map(
     camera: CameraInput, reconstruction: Reconstruction, rates: Sequence[float]
 ) -> tuple[TimeMapEstimate | None, str]:
@@ -147,62 +165,71 @@ def find_time_map(
     lags, to explain most of the common rows, and to predict either half of them from the other half.
     """
     tracks = {label: track for label, track in camera.tracks.items() if isinstance(track, SmoothTrack)}
-    labels = [(i, tracks[label]) for i, label in enumerate(reconstruction.labels) if label in tracks]
+    paths = reconstruction.state.trajectories
+    labels = [
+        _SeenLabel(tracks[label], paths[i], observation_times(reconstruction, i))
+        for i, label in enumerate(reconstruction.labels)
+        if label in tracks
+    ]
     if not labels:
         return None, "no label that the others saw"
-    nominal = sorted(_moment_scan(labels, reconstruction, rates[0]), key=lambda one: one.score)
-    verified = [_verify(one, labels, reconstruction, camera) for one in nominal[:_LIKELY_CANDIDATES]]
+    moments = _path_moments(labels)
+    nominal = sorted(_moment_scan(labels, moments, rates[0]), key=lambda one: one.score)
+    verified = [_verify(one, labels, camera) for one in nominal[:_LIKELY_CANDIDATES]]
     if verified and _misfit(verified):
         likely = nominal[:_LIKELY_CANDIDATES]
-        reason = _other_image([_verify(one, labels, reconstruction, camera, _SCALES) for one in likely])
+        reason = _other_image([_verify(one, labels, camera, _SCALES) for one in likely])
         if reason:
             return None, reason
-    found = [candidate for rate in rates[1:] for candidate in _moment_scan(labels, reconstruction, rate)]
+    found = [candidate for rate in rates[1:] for candidate in _moment_scan(labels, moments, rate)]
     found = sorted([*found, *nominal[_LIKELY_CANDIDATES:]], key=lambda one: one.score)[: _CANDIDATES - len(verified)]
-    verified += [_verify(one, labels, reconstruction, camera) for one in found]
+    verified += [_verify(one, labels, camera) for one in found]
     if not verified:
         return None, "too little seen together with the other cameras"
     if reason := _misfit(verified):
         return None, reason
     best = _best_and_next(verified)[0]
-    centre = 0.5 * (
-        min(float(track.time[0]) for _, track in labels) + max(float(track.time[-1]) for _, track in labels)
-    )
+    centre = 0.5 * (min(float(one.track.time[0]) for one in labels) + max(float(one.track.time[-1]) for one in labels))
     return TimeMapEstimate(best.rate, best.rate * centre + best.offset, centre), ""
 
 
-def _moment_scan(
-    labels: list[tuple[int, SmoothTrack]], reconstruction: Reconstruction, rate: float
-) -> list[TimeMapCandidate]:
+def _path_moments(labels: list[_SeenLabel]) -> _PathMoments | None:
+    """Moments of the paths where two cameras saw them; None where that is nowhere."""
+    begin, end = min(one.path.basis.begin for one in labels), max(one.path.basis.end for one in labels)
+    time = np.asarray(begin + _STEP_S * np.arange(int((end - begin) / _STEP_S) + 1), dtype=np.float64)
+    world = np.stack([one.path.at(time) for one in labels])
+    present = np.isfinite(world).all(axis=2) & np.stack([seen_by_two(one.observed, time) for one in labels])
+    if not present.any():
+        return None
+    middle, spread = world[present].mean(axis=0), float(world[present].std()) or 1.0
+    scaled = np.where(present[:, :, None], (world - middle) / spread, 0.0)
+    homogeneous = np.concatenate([scaled, present[:, :, None]], axis=2)
+    first, second = np.triu_indices(4)
+    return _PathMoments(begin, (homogeneous[:, :, first] * homogeneous[:, :, second]).transpose(2, 0, 1))
+
+
+def _moment_scan(labels: list[_SeenLabel], moments: _PathMoments | None, rate: float) -> list[TimeMapCandidate]:
     """The best lags in each octave of support by the direct linear transform, from 40 correlations by FFT.
 
     Over the camera matrix with rows p1, p2, p3 the squared image residual is that of p1 X - u p3 X and p2 X - v p3 X
     over (p3 X)². p1 and p2 follow from p3 (Schur complement), which leaves a generalised eigenvalue of order four.
     """
-    paths = reconstruction.state.trajectories
-    begin, end = min(path.basis.begin for path in paths), max(path.basis.end for path in paths)
-    grid = grid_tracks([track.scaled(rate) for _, track in labels], _STEP_S, 0.5)
-    time = np.asarray(begin + _STEP_S * np.arange(int((end - begin) / _STEP_S) + 1), dtype=np.float64)
-    world = np.stack([paths[number].at(time) for number, _ in labels])
-    present = np.isfinite(world).all(axis=2) & np.stack([seen_by_two(reconstruction, i, time) for i, _ in labels])
-    if not present.any():
+    if moments is None:
         return []
-    middle, spread = world[present].mean(axis=0), float(world[present].std()) or 1.0
-    scaled = np.where(present[:, :, None], (world - middle) / spread, 0.0)
-    homogeneous = np.concatenate([scaled, present[:, :, None]], axis=2)
-    first, second = np.triu_indices(4)
-    products = (homogeneous[:, :, first] * homogeneous[:, :, second]).transpose(2, 0, 1)
+    products, instants = moments.products, moments.products.shape[2]
+    grid = grid_tracks([one.track.scaled(rate) for one in labels], _STEP_S, 0.5)
     u, v = grid.points[:, :, 0], grid.points[:, :, 1]
     image = grid.weight * np.stack([np.ones_like(u), u, v, u**2 + v**2])
-    length = fast_length(world.shape[1] + u.shape[1])
+    length = fast_length(instants + u.shape[1])
     spectra, others = rfft(products, length), np.conj(rfft(image, length))
     sums = np.stack([irfft(np.einsum("plm,lm->pm", spectra, one), length) for one in others])
-    lags = np.arange(-(u.shape[1] - 1), world.shape[1])
+    lags = np.arange(-(u.shape[1] - 1), instants)
     sums = sums[:, :, lags % length]
     support = sums[0, -1] * _STEP_S
     enough = np.flatnonzero(support > _MIN_COMMON_S)
     if not len(enough):
         return []
+    first, second = np.triu_indices(4)
     index = np.zeros((4, 4), dtype=np.int64)
     index[first, second] = index[second, first] = np.arange(len(first))
     one, by_u, by_v, square = (part[index][:, :, enough].transpose(2, 0, 1) for part in sums)
@@ -220,7 +247,7 @@ def _moment_scan(
         for k in mine[np.argsort(cost[mine], kind="stable")]:
             if all(abs(enough[k] - enough[other]) * _STEP_S > _DISTINCT_S for other in taken):
                 taken.append(int(k))
-                offset = begin + lags[enough[k]] * _STEP_S - grid.begin
+                offset = moments.begin + lags[enough[k]] * _STEP_S - grid.begin
                 out.append(TimeMapCandidate(rate, float(offset), float(cost[k]) / typical, float(support[enough[k]])))
             if len(taken) == _CANDIDATES_PER_OCTAVE:
                 break
@@ -249,30 +276,30 @@ class _Verified:
 
 def _verify(
     candidate: TimeMapCandidate,
-    labels: list[tuple[int, SmoothTrack]],
-    reconstruction: Reconstruction,
+    labels: list[_SeenLabel],
     camera: CameraInput,
     scales: Sequence[Floats] = (),
 ) -> _Verified:
     """The candidate at the best lag near it, with the lens as it is given or at the best of ``scales``."""
-    samples = [(number, *_along_path(track)) for number, track in labels]
+    samples = [(one, *_along_path(one.track)) for one in labels]
 
-    def common(offset: float, scale: Floats) -> tuple[Floats, Floats, Floats, float]:
+    @lru_cache(maxsize=1)
+    def common(offset: float) -> tuple[Floats, Floats, Floats]:
         world, image, times = [], [], []
-        for number, time, points in samples:
+        for label, time, points in samples:
             internal = np.asarray(candidate.rate * time + offset, dtype=np.float64)
-            where = reconstruction.state.trajectories[number].at(internal)
-            good = np.isfinite(where).all(axis=1) & seen_by_two(reconstruction, number, internal)
+            where = label.path.at(internal)
+            good = np.isfinite(where).all(axis=1) & seen_by_two(label.observed, internal)
             world.append(where[good])
-            image.append(points[good] * scale)
+            image.append(points[good])
             times.append(internal[good])
-        focal = camera.intrinsics.focal / float(scale[1])
-        return np.concatenate(world), np.concatenate(image), np.concatenate(times), focal
+        return np.concatenate(world), np.concatenate(image), np.concatenate(times)
 
     def cost(offset: float, scale: Floats) -> float:
-        positions, seen, _, focal = common(offset, scale)
+        positions, seen, _ = common(offset)
         if len(positions) < _MIN_POINTS:
             return _TRUNCATION_PX**2
+        seen, focal = seen * scale, camera.intrinsics.focal / float(scale[1])
         residual = _resected_residuals(positions, seen, positions, seen, focal)
         return float((np.minimum(residual, _TRUNCATION_PX) ** 2).mean())
 
@@ -285,7 +312,8 @@ def _verify(
                 offset, lowest = trial, there
     for factor in _SCALE_STEPS if len(scales) else ():
         scale = min((scale, scale * factor, scale / factor), key=lambda one: cost(offset, one))
-    positions, seen, when, focal = common(offset, scale)
+    positions, seen, when = common(offset)
+    seen, focal = seen * scale, camera.intrinsics.focal / float(scale[1])
     if len(positions) < _MIN_POINTS:
         return _Verified(candidate.rate, offset, scale, _TRUNCATION_PX**2, 0.0, False)
     residual = _resected_residuals(positions, seen, positions, seen, focal)

@@ -48,6 +48,11 @@ class ClockSegments:
         relabelled.boot_id = segment
         return relabelled, change
 
+    def report_step(self, camera: str, size: float) -> None:
+        """Raise the alarm for a step [s] that the images show, smaller than one that the stamps would."""
+        if camera in self.alarms or len(self.alarms) < _MAX_ALARMS:
+            self.alarms[camera] = f"the clock of {camera} stepped by {size:+.3f} s"
+
     def to_present(self, calibration: Calibration, boots: dict[str, str]) -> tuple[Calibration, dict[str, str]]:
         """The calibration with every time map moved to its clock's present segment, and the names of these segments.
 

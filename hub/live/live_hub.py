@@ -549,9 +549,20 @@ class LiveHub:
         self._unverified = None
         self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
         self.session = job.rig, job.observations
+        self._report_steps(found)
         self.calibration, self.calibrated_at = found, now
         self._solved_boot_ids = {name: boots[name] for name in found.cameras if name in boots}
         return [event, *self._publish_present()]
+
+    def _report_steps(self, found: Calibration) -> None:
+        """Count the clock steps that the images show and raise an alarm for each, once."""
+        known = {} if self.calibration is None else self.calibration.cameras
+        for name, camera in found.cameras.items():
+            before = [at for at, *_ in known[name].clock_steps] if name in known else []
+            for at, size, _ in camera.clock_steps:
+                if at not in before:
+                    self.counters["clock_steps"] += 1
+                    self.stream.clocks.report_step(name, size)
 
     def _suspect(self, job: SolverJob, now: float) -> None:
         """Leave one camera of a job that failed out, first those without which there was an answer, each in turn."""

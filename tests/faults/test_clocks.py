@@ -76,6 +76,24 @@ def test_a_step_is_reported_at_once_and_the_offset_follows(size: float) -> None:
     assert right <= 5.0
 
 
+def test_a_step_too_small_for_the_stamps_is_seen_in_the_images_and_reported() -> None:
+    hub = LiveHub(LiveSettings(interval_s=4.0, window_s=30.0))
+    shown, maps = 0.0, list[tuple[float, float, float]]()
+    for true, message in stream(STEP_AT_S + 8.0, "step", 0.04):
+        hub.handle(message, 1000.0 + true)
+        if isinstance(message, pb.Observation) and message.camera == "cam1":
+            shown = message.device_time_ns * 1e-9
+        for answer in hub.tick(true):
+            if isinstance(answer, pb.Calibration) and answer.status == "solved":
+                found = {camera.camera: camera for camera in answer.cameras}["cam1"]
+                maps.append((true, found.clock_rate, found.time_offset))
+    (_, rate, offset) = [one for one in maps if one[0] < STEP_AT_S][-1]
+    error = maps[-1][1] * shown + maps[-1][2] - (rate * (shown - 0.04) + offset)
+    assert hub.counters["clock_steps"] == 1
+    assert hub.stream.clocks.alarms["cam1"].startswith("the clock of cam1 stepped by +0.0")
+    assert abs(error) < 5e-3
+
+
 def test_a_rate_change_of_200_ppm_is_reported() -> None:
     """Only the hub's own clock makes this observable; delays scatter by 0.3 ms here."""
     hub = LiveHub(LiveSettings(interval_s=1e9))

@@ -87,6 +87,7 @@ def calibrate(
     seed
         Seed of the pose nodes' random samples (--solver distributed); the other solvers use no random numbers.
     """
+    retain_freed_memory()
     from hub.api import CalibrationOptions
     from hub.api import calibrate as solve
 
@@ -95,7 +96,6 @@ def calibrate(
     read = _load(session, observations, out, marker, detector, json)
     read = _with_scale(read, height, limb)
     command = shlex.join(["syncline", *sys.argv[1:]])
-    retain_freed_memory()
     defer_modules("numpy", UNUSED_OF_NUMPY)
     from deploy.offline.outputs import report_refusal, report_result
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from protocols.geometry.types import Floats, Ints
 from protocols.session.observations import Observations, Track
@@ -128,6 +127,8 @@ def _links(going: list[_Open], seen: Floats, time: float) -> tuple[dict[int, int
 
     seen: (people, joints, 2).
     """
+    from scipy.optimize import linear_sum_assignment  # a quarter of a second to import, which markers do not need
+
     if not going or not len(seen):
         return {}, set()
     ahead = np.stack([one.last + one.velocity * (time - one.time) for one in going])

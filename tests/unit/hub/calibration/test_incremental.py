@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hub.bundle import model_comparison
 from hub.calibration.incremental import update_calibration
 from hub.calibration.pipeline import calibrate
 from hub.clocks.arrival_prior import ERROR_BOUND_S, ArrivalPriors
@@ -185,3 +186,56 @@ def test_arrival_priors_need_steady_delays() -> None:
     assert backlog.priors() == {}
     steady.handle("a", "b1", 5.0, 1030.0)
     assert steady.priors() == {}, "another boot is another clock"
+
+
+@pytest.mark.parametrize(("camera", "size"), [("cam2", 0.03), ("cam0", -0.06), ("cam1", 0.015)])
+def test_a_clock_step_inside_the_window_is_recognised_and_the_map_is_that_after_it(camera: str, size: float) -> None:
+    """It is no move of the camera, and the time that is published does not step with the reference camera's clock."""
+    session = simulate(2, 3, 45)
+    mine = np.array([name == camera for name in session.camera])
+    at = float(np.quantile(session.time[mine], 0.6))
+    begin = session.true_time(camera, at)
+    stepped = replace(session, time=session.time + np.where(mine & (session.time >= at), size, 0.0))
+    true = np.array([session.true_time(c, t) for c, t in zip(session.camera, session.time, strict=True)])
+    last: Calibration | None = None
+    for seconds in (begin - 3.0, begin + 3.0, begin + 6.0, 45.0):
+        rows = stepped.observations(np.flatnonzero(true <= seconds))
+        update = update_calibration(session.rig, rows, last, full=last is None, search=last is None)
+        assert not update.moved
+        last = update.calibration
+        assert {name: len(one.clock_steps) for name, one in last.cameras.items() if one.clock_steps} == (
+            {} if seconds < begin else {camera: 1}
+        )
+        published = session.shown("cam0", seconds)
+        for name, one in last.cameras.items():
+            shown = session.shown(name, seconds) + (size if name == camera and seconds >= begin else 0.0)
+            error = float(one.time_map.reference_from_camera(CameraTime(shown))) - published
+            assert abs(error) < 2e-3
+    ((when, found, std),) = last.cameras[camera].clock_steps
+    assert abs(when - at) < 0.7
+    assert abs(found - size) < 4.0 * std < 4e-3
+
+
+def test_the_first_answer_of_a_window_with_a_clock_step_holds_after_it() -> None:
+    session = simulate(1, 4, 40)
+    mine = np.array([name == "cam2" for name in session.camera])
+    at = float(np.quantile(session.time[mine], 0.8))
+    stepped = replace(session, time=session.time + np.where(mine & (session.time >= at), 0.03, 0.0))
+    found = update_calibration(session.rig, stepped.observations(), None).calibration
+    assert len(found.cameras["cam2"].clock_steps) == 1
+    shown = CameraTime(session.shown("cam2", 40.0) + 0.03)
+    error = float(found.cameras["cam2"].time_map.reference_from_camera(shown)) - session.shown(found.reference, 40.0)
+    assert abs(error) < 2.0 * found.cameras["cam2"].time_offset_std < 4e-3
+
+
+def test_a_step_that_a_wrong_lens_explains_better_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a real rig whose focal lengths are 2 % off, slow errors of a part of the flight look like steps of 30 ms."""
+    session = simulate(1, 4, 40)
+    mine = np.array([name == "cam2" for name in session.camera])
+    at = float(np.quantile(session.time[mine], 0.8))
+    stepped = replace(session, time=session.time + np.where(mine & (session.time >= at), 0.03, 0.0))
+    first = update_calibration(session.rig, until(session, 30.0), None).calibration
+    better = model_comparison.LensTest(1, 0.02, 0.003, 1e9, 20.0)
+    monkeypatch.setattr(model_comparison, "refuted_lenses", lambda *of: [better])
+    found = update_calibration(session.rig, stepped.observations(), first, full=False, search=False).calibration
+    assert not any(camera.clock_steps for camera in found.cameras.values())
