@@ -30,7 +30,8 @@ _FULL_EVERY = 8  # frames without a board between searches at full resolution, o
 class BoardDetector:
     """Detects the corners of a board whose print is known; labels are those of ``Board.points``."""
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: Board, enlarged: float = _ENLARGED) -> None:
+        self._enlarged = enlarged
         self._board = next(iter(board.prints()))
         self._finder = Finder(self._board)
         self._last: Floats | None = None
@@ -96,7 +97,7 @@ class BoardDetector:
         part = np.ascontiguousarray(grey[y:bottom, x:right])
         if min(part.shape) < 24:
             return self._finder.find(part)
-        scale = min(1.0 if self._board.kind == "chessboard" else _ENLARGED, most / max(part.shape))
+        scale = min(1.0 if self._board.kind == "chessboard" else self._enlarged, most / max(part.shape))
         size = max(round(part.shape[1] * scale), 1), max(round(part.shape[0] * scale), 1)
         kernel = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
         resized = part if scale == 1.0 else np.asarray(cv2.resize(part, size, interpolation=kernel), dtype=np.uint8)
