@@ -35,7 +35,7 @@ def board_views(board: Board, frames: Iterable[VideoFrame], step: int, width: in
     Inverted, mirrored and legacy prints are found out from the first frames that show any of them.
     """
     chosen = (frame for frame in frames if frame.frame % step == 0)
-    finders = [BoardDetector(print_) for print_ in board.prints()]
+    finders = [BoardDetector(print_, 1.0) for print_ in board.prints()]
     points = np.array(list(board.points().values()))
     before: Floats | None = None
     while begin := list(islice(chosen, _PRINT_FRAMES if len(finders) > 1 else 1)):
@@ -43,7 +43,7 @@ def board_views(board: Board, frames: Iterable[VideoFrame], step: int, width: in
             counts = [sum(len(_find(finder, frame)[0]) for frame in begin) for finder in finders]
             if not any(counts):
                 continue
-            finders = [BoardDetector(finders[int(np.argmax(counts))].board)]
+            finders = [BoardDetector(finders[int(np.argmax(counts))].board, 1.0)]
         for frame in begin:
             numbers, pixels = _find(finders[0], frame)
             if len(numbers) < MIN_CORNERS or np.linalg.matrix_rank(points[numbers][:, :2] - points[numbers[0], :2]) < 2:

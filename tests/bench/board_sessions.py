@@ -233,11 +233,8 @@ def score(one: Session, folder: Path, lenses: bool) -> tuple[str, Floats, Floats
         lags.append(abs(error))
         halves.append(2.0 * abs(error) * mine.fps)
         z.append(error / row["lag_std_s"])
-    focal = [
-        np.log(one_.intrinsics.focal / true[name].lens.focal) / one_.focal_std
-        for name, one_ in found.items()
-        if one_.focal_std > 0.0
-    ]
+    stds = {name: float(result["cameras"][name].get("focal_std") or 0.0) for name in found}
+    focal = [np.log(found[n].intrinsics.focal / true[n].lens.focal) / std for n, std in stds.items() if std > 0.0]
     worst = 100 * float(np.linalg.norm(fit.points(places) - real, axis=1).max())
     line = (
         f"{len(found)} of {len(true)} cameras, {np.degrees(max(turns)):.2f}°, {worst:.2f} cm, "
@@ -255,7 +252,7 @@ def _table(name: str, camera: BoardCamera) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(1, 8)))
     parser.add_argument("--keep", type=Path)
     options = parser.parse_args()
     scores: dict[bool, list[tuple[Floats, Floats]]] = {False: [], True: []}

@@ -1,7 +1,8 @@
 """Detector of a board's corners in the images of one camera: an image pyramid, and tracking between full searches.
 
 The board is searched in an image of at most ``SEARCH_PX``; where it was a moment ago, only its surroundings are
-searched, at the resolution at which it is large enough. Corners are then refined in the full image.
+searched, at the resolution at which it is large enough. Corners are then refined in the full image. Small images of
+boards with tags are enlarged: the bits of a tag 14 px wide are two pixels, and next to its corners are others.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from protocols.geometry.types import Floats
 SEARCH_PX = 1280
 """Longer side [px] of the image in which the whole frame is searched."""
 _TRACK_PX = 960  # … in which the surroundings of the last place are searched
+_ENLARGED = 2.0  # at most
 _MARGIN = 1.0  # of the board's extent around its last place
 _KEPT_SHARE = 0.8  # fewer of the corners of the last frame: the whole frame is searched
 _FULL_EVERY = 8  # frames without a board between searches at full resolution, or by every method
@@ -28,7 +30,8 @@ _FULL_EVERY = 8  # frames without a board between searches at full resolution, o
 class BoardDetector:
     """Detects the corners of a board whose print is known; labels are those of ``Board.points``."""
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: Board, enlarged: float = _ENLARGED) -> None:
+        self._enlarged = enlarged
         self._board = next(iter(board.prints()))
         self._finder = Finder(self._board)
         self._last: Floats | None = None
@@ -94,14 +97,12 @@ class BoardDetector:
         part = np.ascontiguousarray(grey[y:bottom, x:right])
         if min(part.shape) < 24:
             return self._finder.find(part)
-        scale = min(1.0, most / max(part.shape))
-        if scale == 1.0:
-            numbers, pixels = self._finder.find(part, thorough=thorough)
-            return numbers, pixels + [x, y]
+        scale = min(1.0 if self._board.kind == "chessboard" else self._enlarged, most / max(part.shape))
         size = max(round(part.shape[1] * scale), 1), max(round(part.shape[0] * scale), 1)
-        small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-        numbers, pixels = self._finder.find(small, thorough=thorough)
-        factor = np.array([part.shape[1] / size[0], part.shape[0] / size[1]])
-        full = (pixels + 0.5) * factor - 0.5
-        numbers, full = self._finder.refine(part, (numbers, full))
+        kernel = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+        resized = part if scale == 1.0 else np.asarray(cv2.resize(part, size, interpolation=kernel), dtype=np.uint8)
+        numbers, pixels = self._finder.find(resized, thorough=thorough)
+        full = (pixels + 0.5) * [part.shape[1] / size[0], part.shape[0] / size[1]] - 0.5
+        if scale < 1.0:
+            numbers, full = self._finder.refine(part, (numbers, full))
         return numbers, full + [x, y]

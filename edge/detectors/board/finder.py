@@ -15,7 +15,9 @@ Grey = npt.NDArray[np.uint8]
 Corners = tuple[Ints, Floats]
 """Numbers (n,) of the corners, and their pixels (n, 2). A corner's number is its place in ``Finder.labels``."""
 _NOTHING: Corners = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
-_SUBPIX_SHARE, _SUBPIX_LEAST, _SUBPIX_MOST = 0.12, 2, 9  # half window, over the distance of neighbouring corners; px
+_SUBPIX_LEAST, _SUBPIX_MOST = 2, 9  # px: half window
+_SUBPIX_SHARE, _SUBPIX_SHARE_OF_TAGS = 0.4, 0.12  # of the distance of neighbouring corners; tags are in between
+_MOST_CHANGE = 0.4  # of the step between corners to the next: a board seen from 5 squares away, tilted by 60 degrees
 
 
 class Finder:
@@ -54,7 +56,8 @@ class Finder:
         numbers, pixels = corners
         if not len(numbers):
             return corners
-        half = int(np.clip(_SUBPIX_SHARE * self.pitch(corners), _SUBPIX_LEAST, _SUBPIX_MOST))
+        share = _SUBPIX_SHARE if self.board.kind == "chessboard" else _SUBPIX_SHARE_OF_TAGS
+        half = int(np.clip(share * self.pitch(corners), _SUBPIX_LEAST, _SUBPIX_MOST))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
         found = cv2.cornerSubPix(
             grey, pixels.astype(np.float32).reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria
@@ -100,22 +103,25 @@ class Finder:
     def _find_chessboard(self, grey: Grey, thorough: bool) -> Corners:
         assert self.board.squares is not None
         inner = self.board.squares[0] - 1, self.board.squares[1] - 1
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE
-        found, corners = cv2.findChessboardCornersSB(grey, inner, flags=flags)
-        if not found:  # the classic finder likes small boards and blur better
-            fast = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-            found, corners = cv2.findChessboardCorners(grey, inner, flags=fast | cv2.CALIB_CB_FAST_CHECK)
-            if found and corners is not None:
-                numbers = np.arange(len(corners), dtype=np.int64)
-                _, refined = self.refine(grey, (numbers, np.asarray(corners, dtype=np.float64).reshape(-1, 2)))
-                corners = refined
-        if not found and thorough:
-            exhaustive = flags | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-            found, corners = cv2.findChessboardCornersSB(grey, inner, flags=exhaustive)
-        if not found or corners is None:
-            return _NOTHING
-        pixels = np.asarray(corners, dtype=np.float64).reshape(inner[1], inner[0], 2)
-        return np.arange(inner[0] * inner[1], dtype=np.int64), _ordered(grey, pixels).reshape(-1, 2)
+        numbers = np.arange(inner[0] * inner[1], dtype=np.int64)
+        sector, classic = cv2.findChessboardCornersSB, cv2.findChessboardCorners
+        # The classic finder likes small boards and blur better.
+        methods: list[tuple[Any, int]] = [
+            (sector, cv2.CALIB_CB_NORMALIZE_IMAGE),
+            (classic, cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK),
+        ]
+        if thorough:
+            methods.append((sector, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY))
+        for method, flags in methods:
+            found, corners = method(grey, inner, flags=flags)
+            if not found or corners is None:
+                continue
+            # The sector-based finder's corners are biased by up to 0.03 px, which unknown lenses take up.
+            _, refined = self.refine(grey, (numbers, np.asarray(corners, dtype=np.float64).reshape(-1, 2)))
+            pixels = refined.reshape(inner[1], inner[0], 2)
+            if _is_regular(pixels):
+                return numbers, _ordered(grey, pixels).reshape(-1, 2)
+        return _NOTHING
 
     def _mirrored(self, numbers: Ints) -> Ints:
         """The places on the sheet of a mirrored print's corners: its columns are exchanged."""
@@ -128,6 +134,18 @@ class Finder:
             return np.asarray(4 * (row * columns + columns - 1 - column) + np.array([1, 0, 3, 2])[corner])
         row, column = np.divmod(numbers, columns - 1)
         return np.asarray(row * (columns - 1) + columns - 2 - column)
+
+
+def _is_regular(corners: Floats) -> bool:
+    """Whether the steps between corners (rows, columns, 2) change little from one to the next.
+
+    Finders take the edge of the margin for a row of small boards, or a corner for its neighbour.
+    """
+    for line in (corners, corners.transpose(1, 0, 2)):
+        change = np.linalg.norm(line[2:] - 2.0 * line[1:-1] + line[:-2], axis=2)
+        if (change > _MOST_CHANGE * 0.5 * np.linalg.norm(line[2:] - line[:-2], axis=2)).any():
+            return False
+    return True
 
 
 def _ordered(grey: Grey, corners: Floats) -> Floats:
@@ -162,7 +180,9 @@ def _charuco_detector(board: Board) -> Any:
     assert board.squares is not None
     pattern = cv2.aruco.CharucoBoard(board.squares, 1.0, board.ratio, load_dictionary(board.dictionary))
     pattern.setLegacyPattern(bool(board.legacy))
-    return cv2.aruco.CharucoDetector(pattern)
+    parameters = cv2.aruco.CharucoParameters()
+    parameters.tryRefineMarkers = True  # where the board has them: four times as many corners of small boards
+    return cv2.aruco.CharucoDetector(pattern, parameters)
 
 
 def _tag_detector(board: Board) -> Any:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hub.bundle.datum.gauge import fix_gauge
-from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, RATE, READOUT
+from hub.bundle.problem import CAMERA_PARAMETERS, CENTRE, FOCAL, OFFSET, RATE, READOUT
 from hub.calibration.rigid_body.lag import BodyPair
 from hub.calibration.rigid_body.noise import residuals
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval
@@ -30,8 +30,8 @@ _SCALE_CONFLICT = 0.02  # relative difference of the board's scale from the cont
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodySolution:
-    """An adjusted problem. names: its cameras, in order. lens_stds: relative stds of focal lengths that an earlier
-    adjustment of the same views estimated."""
+    """An adjusted problem. names: its cameras, in order. estimated: stds of lenses that an earlier
+    adjustment of the same views estimated, as ``lens_stds``."""
 
     rig: Rig
     labels: list[str]
@@ -42,15 +42,16 @@ class BodySolution:
     refused: dict[str, str]
     known: FixedCalibration | None = None
     warnings: tuple[str, ...] = ()
-    lens_stds: dict[str, float] = field(default_factory=dict)
+    estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
 
-    def focal_stds(self) -> dict[str, float]:
-        """Relative std of each estimated focal length; 0 where the lens was given."""
-        covariance = body_covariance(self.problem, self.state)
-        return {
-            name: covariance.std(i, FOCAL) if self.problem.free_lens[i] else self.lens_stds.get(name, 0.0)
-            for i, name in enumerate(self.names)
-        }
+    def lens_stds(self) -> dict[str, tuple[float, float]]:
+        """Of each estimated lens, the relative std of the focal length and the std of the optical axis [rad]."""
+        covariance, out = body_covariance(self.problem, self.state), dict(self.estimated)
+        for i, name in enumerate(self.names):
+            if self.problem.free_lens[i]:
+                centre = max(covariance.std(i, CENTRE), covariance.std(i, CENTRE + 1))
+                out[name] = covariance.std(i, FOCAL), centre / self.state.cameras[i].intrinsics.focal
+        return out
 
 
 def publish(rig: Rig, solution: BodySolution) -> Calibration:
@@ -60,7 +61,7 @@ def publish(rig: Rig, solution: BodySolution) -> Calibration:
     world, scale, warnings = _world(rig, solution)
     requested = rig.metadata.get("reference")
     reference = names.index(requested) if requested in names else 0
-    stds = solution.focal_stds()
+    stds = solution.lens_stds()
     maps = [_time_map(problem, state, i, reference) for i in range(len(names))]
     cameras = {
         name: CameraCalibration(
@@ -73,7 +74,7 @@ def publish(rig: Rig, solution: BodySolution) -> Calibration:
             if solution.known is None
             else solution.known.cameras[name].position_std,
             rms_px=_rms(problem, state, i),
-            focal_std=stds[name],
+            focal_std=stds[name][0] if name in stds else 0.0,
             readout=state.cameras[i].readout,
             readout_std=covariance.std(i, READOUT),
             lag_time=state.cameras[i].centre + problem.views[i].time_origin,
@@ -92,7 +93,7 @@ def publish(rig: Rig, solution: BodySolution) -> Calibration:
         refused={name: solution.refused[name] for name in rig.cameras if name in solution.refused},
         trajectories=_trajectories(rig, solution, covariance, world, reference),
         pairs=tuple(_pair(solution, cameras, pair, found) for pair, found in solution.pairs.items()),
-        warnings=(*solution.warnings, *warnings, *_notes(solution, cameras)),
+        warnings=(*solution.warnings, *warnings, *_notes(solution, cameras, stds)),
         residuals={name: _residual_rows(problem, state, i) for i, name in enumerate(names)},
         convergence=state.steps,
     )
@@ -159,12 +160,14 @@ def _residual_rows(problem: BodyProblem, state: BodyState, camera: int) -> Float
     return np.column_stack([stamps, views.pixels, -values])[good]
 
 
-def _notes(solution: BodySolution, cameras: Mapping[str, CameraCalibration]) -> tuple[str, ...]:
+def _notes(
+    solution: BodySolution, cameras: Mapping[str, CameraCalibration], stds: Mapping[str, tuple[float, float]]
+) -> tuple[str, ...]:
     lenses = tuple(
         f"{name}: its lens was estimated from the board: focal length {camera.intrinsics.focal:.1f} px ± "
-        f"{100 * camera.focal_std:.2g} % (std)"
+        f"{100 * stds[name][0]:.2g} %, optical axis ± {np.degrees(stds[name][1]):.2g}° (stds)"
         for name, camera in cameras.items()
-        if camera.focal_std > 0.0
+        if name in stds
     )
     jitter = tuple(
         f"{name}: its stamps jitter by {1e3 * std:.2g} ms (std): each frame's time was estimated from the board"

@@ -240,8 +240,8 @@ def _in_step(given: _Input, free: BodySolution, report: Progress) -> BodySolutio
         'they are taken as recorded in step, frame by frame; clock = "independent" in rig.toml estimates a lag of each'
     )
     warnings = (warning, *((f"by the board's motion, exposures differ from the stamps: {late}",) if late else ()))
-    focal = free.focal_stds()
-    return replace(solution, warnings=warnings, lens_stds={name: focal[name] for name in solution.names})
+    estimated = {name: std for name, std in free.lens_stds().items() if name in solution.names}
+    return replace(solution, warnings=warnings, estimated=estimated)
 
 
 def _failed(pairs: Mapping[tuple[str, str], BodyPair]) -> tuple[PairReport, ...]:

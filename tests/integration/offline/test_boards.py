@@ -171,6 +171,50 @@ def test_a_large_image_gives_the_corners_of_full_resolution() -> None:
     assert np.abs(pixels[a] - full[b]).max() < 0.25
 
 
+def _corner_errors(kind: str, focal: float) -> np.ndarray:
+    """Errors [px] of the corners found in 8 views of a board by a camera of 640x480."""
+    lens = Intrinsics(640, 480, np.array([[focal, 0.0, 319.5], [0.0, focal, 239.5], [0.0, 0.0, 1.0]]))
+    board = next(iter(Board(kind, (8, 6), inverted=False, mirrored=False).prints()))  # type: ignore[arg-type]
+    drawing = boards.charuco_image() if kind == "charuco" else boards.chessboard_image()
+    renderer, errors = boards.BoardRenderer(lens, 1), []
+    points = np.array(list(board.points().values())) - [4.0, 3.0, 0.0]
+    for rotation, centre in boards.board_poses(8, 3, 0.5, 0.15):
+        numbers, pixels = BoardDetector(board).find(renderer.draw(drawing, rotation, centre)[..., 0].copy())
+        true = lens.project(points @ rotation.T + centre)
+        nearest = np.linalg.norm(pixels[:, None] - true[None], axis=2).argmin(axis=1)
+        errors.append(pixels - true[nearest])
+        assert len(numbers) == len(pixels)
+    return np.concatenate(errors)
+
+
+def test_corners_of_a_chessboard_have_no_bias_that_an_unknown_lens_would_take_up() -> None:
+    errors = _corner_errors("chessboard", 320.0)
+    assert len(errors) == 8 * 35
+    assert np.abs(errors.mean(axis=0)).max() < 0.005
+    assert errors.std() < 0.05
+
+
+def test_a_grid_with_the_margin_for_a_column_is_searched_again_by_another_method(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    board = next(iter(Board("chessboard", (8, 5)).prints()))
+    squares = (np.indices((5, 8)).sum(axis=0) % 2 * 255).astype(np.uint8)
+    image = np.pad(np.kron(squares, np.ones((24, 24), np.uint8)), 40, constant_values=255)
+    true = np.stack(np.meshgrid(24.0 * np.arange(1, 8) + 39.5, 24.0 * np.arange(1, 5) + 39.5), axis=-1)
+    margin = true.copy()
+    margin[:, 6] += [17.0, 0.0]
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", lambda *_, **__: (True, margin.astype(np.float32)))
+    _, pixels = Finder(board).find(image)
+    assert len(pixels) == 28
+    assert np.abs(np.sort(pixels, axis=0) - np.sort(true.reshape(-1, 2), axis=0)).max() < 0.1
+
+
+def test_tags_of_two_pixels_a_bit_are_read_and_leave_the_corners_next_to_them_alone() -> None:
+    errors = _corner_errors("charuco", 170.0)
+    assert len(errors) > 200
+    assert errors.std() < 0.13
+
+
 def test_a_board_too_small_is_bad_input() -> None:
     with pytest.raises(InputError, match="too small"):
         parse_board({"board": "chessboard", "squares": "3x3"})

@@ -64,6 +64,11 @@ def test_lenses_are_estimated_from_the_same_views_with_their_stds() -> None:
         off = abs(camera.intrinsics.focal / world.cameras[name].lens.focal - 1.0)
         assert 0.0 < camera.focal_std < 0.005
         assert off < 4.0 * camera.focal_std
+        note = next(text for text in found.warnings if text.startswith(f"{name}: its lens"))
+        axis = np.deg2rad(float(note.split("optical axis ± ")[1].split("°")[0])) * camera.intrinsics.focal
+        centre = camera.intrinsics.matrix[:2, 2] - world.cameras[name].lens.matrix[:2, 2]
+        assert 0.0 < axis < 10.0
+        assert np.abs(centre).max() < 4.0 * axis
 
 
 def test_the_readout_of_rolling_shutters_is_estimated_and_leaves_the_lenses_alone() -> None:
