@@ -33,7 +33,6 @@ _FAST_PAN_S = 1.0  # in which a step in the image may be the camera's; over plai
 _MOVES = 0.3  # speed over the scene at which a heading is given, in target lengths a second
 _LOST_STD, _LOST_AFTER_S = 8.0, 15.0  # in target lengths; as of the ground tracker
 _MAX_GROWTH = 8.0  # of a side since the first frame
-_ASPECT_S = 1.0  # in which the box returns to its first shape; the flow of what is seen in it sums up to another one
 _SCALE_GAIN = 0.5  # of the scale filter's correction, per frame
 _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or angle must gain
 _ANCHOR_STEP = 0.3  # share of the way to it
@@ -221,7 +220,6 @@ class AppearanceTracker:
         if inside > _LEARN_INSIDE:
             wider, higher, turn = self._flow.change(image, box.centre)
             box = box.sized(box.sides * [wider, higher]).turned(turn)
-            box = box.sized(box.sides * (self._aspect(box) ** (min(1.0, dt / _ASPECT_S) * np.array([0.5, -0.5]))))
             self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)
             if self._frame % 3 == 0:
                 box = self._anchored(image, box)
@@ -239,11 +237,6 @@ class AppearanceTracker:
             self._last_sight = box, self._motion_filter.velocity
         self.box = box
         self._flow.remember(image, box)
-
-    def _aspect(self, box: OrientedBox) -> float:
-        """Height over width, over that of the first box."""
-        shape = box.sides / self._first
-        return float(shape[1] / shape[0])
 
     def _respond(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, Response]:
         """The box at the peak of the filter's answer; a second look where the first was off centre."""
