@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import hashlib
 import json
 import os
@@ -20,10 +21,11 @@ import tomli_w
 
 from deploy.offline.recognition import DETECTORS, Target, find_target
 from deploy.offline.single_target import rows_of_one_target
+from edge.detectors import base as detector_base
 from edge.detectors.base import Detector, Kind
 from edge.detectors.board.description import Board
 from edge.detectors.board.detector import BoardDetector
-from edge.detectors.marker.ball import REVISION, MarkerModel
+from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.detectors.plugins import detector_revision, load_detector
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav
@@ -364,11 +366,20 @@ def _one_target(
 
 def _cache_key(video: VideoFile, model: MarkerModel | None, lens: Any, target: Target) -> str:
     """Cache key: a hash of everything that affects a video's detections."""
-    table = None if model is None else {"revision": REVISION, **model.to_table()}
+    table = None if model is None else model.to_table()
     kind = target.kind
     revision = f"{kind} {target.board}" if kind in (*DETECTORS, _NOTHING) else detector_revision(kind)
-    about = [VERSION, has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, revision]
+    about = [VERSION, _program(), has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, revision]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
+
+
+@functools.cache
+def _program() -> str:
+    """A hash of the sources of all detectors and of OpenCV's version: others may detect otherwise."""
+    program = hashlib.sha256(cv2.__version__.encode())
+    for source in sorted(Path(detector_base.__file__).parent.rglob("*.py")):
+        program.update(source.read_bytes())
+    return program.hexdigest()
 
 
 def _read_state(session: Path) -> dict[str, Any]:
