@@ -16,6 +16,7 @@ from edge.detectors.base import Detector
 from edge.detectors.board.description import BOARD_FILE, Board, BoardKind, load_dictionary, read_board
 from edge.detectors.board.detector import SEARCH_PX, BoardDetector
 from edge.detectors.board.finder import Finder
+from edge.detectors.board.saddles import linked_saddles
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.devices.base import Image
@@ -239,9 +240,11 @@ class _Looks:
         """Squares of the chessboard that most frames show; None where there is none."""
         sizes: Counter[tuple[int, int]] = Counter()
         for path in self.paths[:_LOOK_AT]:
-            for image in self.images(path):
+            for image in map(_small, map(_grey, self.images(path))):
+                if not linked_saddles(image, 8):
+                    continue
                 flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
-                found, corners, meta = cv2.findChessboardCornersSBWithMeta(_small(_grey(image)), (4, 4), flags)
+                found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (4, 4), flags)
                 if found and meta is not None and corners is not None:
                     rows, columns = np.asarray(meta).shape[:2]
                     sizes[max(rows, columns) + 1, min(rows, columns) + 1] += 1

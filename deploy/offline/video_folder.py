@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import hashlib
 import json
 import os
@@ -20,15 +21,19 @@ import tomli_w
 
 from deploy.offline.recognition import DETECTORS, Target, find_target
 from deploy.offline.single_target import rows_of_one_target
+from edge.detectors import base as detector_base
 from edge.detectors.base import Detector, Kind
 from edge.detectors.board.description import Board
 from edge.detectors.board.detector import BoardDetector
-from edge.detectors.marker.ball import REVISION, MarkerModel
+from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.detectors.plugins import detector_revision, load_detector
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav
 from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector
+from edge.offline.sound import ENERGY_RATE, sound_energy
 from edge.offline.video import MARKER_FILE, read_marker_model
+from hub.api import RecordedSession
+from hub.clocks.sound import sound_priors
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import read_toml, write_together
 from protocols.core.names import name_from_file
@@ -37,7 +42,6 @@ from protocols.geometry.camera import Intrinsics
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, read_folder
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, read_rig
-from protocols.session.session import Session
 
 Progress = Callable[[str, float], None]
 
@@ -60,8 +64,11 @@ class VideoFile:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class VideoSession(Session):
-    """A session made of videos. summaries: one line a video. refusal: nothing that moves was found in them."""
+class VideoSession(RecordedSession):
+    """A session made of videos. summaries: one line a video. refusal: nothing that moves was found in them.
+
+    clock_priors: the lags of their sound tracks, where these are of the same sounds.
+    """
 
     summaries: tuple[str, ...] = ()
     refusal: Refused | None = None
@@ -160,6 +167,12 @@ def session_from_videos(
         metadata |= _body_metadata(target.board, rows)
         if "clock" not in metadata and _same_stamps([one for one, _ in found.values()]):
             metadata["in_step"] = True
+    heard = {video.camera: sound_energy(video.path) for video in videos if video.camera in found}
+    priors = sound_priors({name: sound for name, sound in heard.items() if sound is not None}, ENERGY_RATE)
+    lines += [
+        f"{name}: lag {prior.unix_minus_camera:+.3f} s by the sound tracks, against {next(iter(priors))}"
+        for name, prior in list(priors.items())[1:]
+    ]
     if refusal is None and target.kind in DETECTORS and target.kind != "marker":
         metadata["target"] = target.text
     # [metadata] goes first, so that its keys do not end up in the last camera's table.
@@ -169,9 +182,9 @@ def session_from_videos(
         rig = read_rig(session / RIG_FILE)
         if refusal is not None:
             refusal.warnings = tuple(warnings)
-        return VideoSession(rig, Observations({}), tuple(warnings), folder.name, tuple(lines), refusal)
+        return VideoSession(rig, Observations({}), tuple(warnings), folder.name, priors, tuple(lines), refusal)
     rig, observations = read_folder(session)
-    return VideoSession(rig, observations, (*warnings, *observations.warnings), folder.name, tuple(lines))
+    return VideoSession(rig, observations, (*warnings, *observations.warnings), folder.name, priors, tuple(lines))
 
 
 def _video_paths(folder: Path) -> list[Path]:
@@ -364,11 +377,20 @@ def _one_target(
 
 def _cache_key(video: VideoFile, model: MarkerModel | None, lens: Any, target: Target) -> str:
     """Cache key: a hash of everything that affects a video's detections."""
-    table = None if model is None else {"revision": REVISION, **model.to_table()}
+    table = None if model is None else model.to_table()
     kind = target.kind
     revision = f"{kind} {target.board}" if kind in (*DETECTORS, _NOTHING) else detector_revision(kind)
-    about = [VERSION, has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, revision]
+    about = [VERSION, _program(), has_pyav(), video.path.name, video.size, video.mtime_ns, table, lens, revision]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
+
+
+@functools.cache
+def _program() -> str:
+    """A hash of the sources of all detectors and of OpenCV's version: others may detect otherwise."""
+    program = hashlib.sha256(cv2.__version__.encode())
+    for source in sorted(Path(detector_base.__file__).parent.rglob("*.py")):
+        program.update(source.read_bytes())
+    return program.hexdigest()
 
 
 def _read_state(session: Path) -> dict[str, Any]:

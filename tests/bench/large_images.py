@@ -23,7 +23,10 @@ from tests.support import boards
 
 Image = npt.NDArray[np.uint8]
 _FRAMES = 16
-_BOARD = {"board": "charuco", "squares": "8x6", "inverted": False, "mirrored": False, "legacy": False}
+_BOARDS = {
+    kind: parse_board({"board": kind, "squares": "8x6", "inverted": False, "mirrored": False, "legacy": False})
+    for kind in ("charuco", "chessboard")
+}
 
 
 def _background() -> Image:
@@ -32,9 +35,8 @@ def _background() -> Image:
     return np.clip((smooth - 127) * 8 + 127, 0, 255).astype(np.uint8)
 
 
-def board_images(background: Image) -> Iterator[Image]:
+def board_images(board: Image, background: Image) -> Iterator[Image]:
     """A board that moves by 40 px a frame."""
-    board = boards.charuco_image()
     height, width = board.shape
     source = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float32)
     for k in range(_FRAMES):
@@ -58,16 +60,17 @@ def measure(name: str, detect: Callable[[Image], list[Detection]], images: Itera
         began = time.process_time()
         found += bool(detect(image))
         seconds.append(time.process_time() - began)
-    print(f"{name:12s} mean {np.mean(seconds):.3f} s, largest {max(seconds):.3f} s a frame, found in {found}/{_FRAMES}")
+    print(f"{name:13s} mean {np.mean(seconds):.3f} s, largest {max(seconds):.3f} s a frame, found in {found}/{_FRAMES}")
 
 
 def main() -> None:
     """Run all."""
     cv2.setNumThreads(1)
     background = _background()
-    measure("board", BoardDetector(parse_board(_BOARD)).detect, board_images(background))
     empty = np.asarray(cv2.cvtColor(background, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-    measure("no board", BoardDetector(parse_board(_BOARD)).detect, iter([empty] * _FRAMES))
+    for kind, image in (("charuco", boards.charuco_image()), ("chessboard", boards.chessboard_image())):
+        measure(kind, BoardDetector(_BOARDS[kind]).detect, board_images(image, background))
+        measure(f"no {kind}", BoardDetector(_BOARDS[kind]).detect, iter([empty] * _FRAMES))
     measure("ball", ball_detector(MarkerModel.default(), None, (3840, 2160)).detect, ball_images(background))
 
 

@@ -105,6 +105,11 @@ def calibrate(
             raise refusal
         with progress_bar(f"calibrating {session.name}", quiet=json) as progress:
             result = solve(read, options, progress)
+        if hasattr(read, "summaries"):  # of videos, whose clock priors are by their sounds
+            from hub.clocks.sound import sound_check
+
+            noted = (*result.calibration.warnings, *sound_check(getattr(read, "clock_priors", {}), result.calibration))
+            result = replace(result, calibration=replace(result.calibration, warnings=noted))
     except Refused as refusal:
         report_refusal(refusal, read, out, command, solver, echo_json=json)
         raise

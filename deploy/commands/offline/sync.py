@@ -143,6 +143,7 @@ def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
     """Calibrate the videos as far as they allow; the file with their clocks. Raises Refused where there are none."""
     from deploy.offline.video_folder import SESSION, session_from_videos
     from hub.api import CALIBRATION, RESULT, calibrate, save_refusal
+    from hub.clocks.sound import sound_pairs
     from protocols.core.errors import Refused
 
     with progress_bar(f"looking for what moves in {folder.name}", quiet=quiet) as progress:
@@ -155,6 +156,7 @@ def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
         with progress_bar("estimating the lags", quiet=quiet) as progress:
             calibrate(session, progress=progress).save(out)
     except Refused as refusal:
+        refusal.pairs += sound_pairs(session.clock_priors, refusal.pairs)
         save_refusal(out, refusal, session)
         if not any(pair.lag_s is not None for pair in refusal.pairs):
             raise

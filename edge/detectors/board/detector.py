@@ -15,16 +15,18 @@ import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.board.description import Board
-from edge.detectors.board.finder import Corners, Finder, Grey
+from edge.detectors.board.finder import NOTHING, Corners, Finder, Grey
+from edge.detectors.board.saddles import linked_saddles
 from protocols.geometry.types import Floats
 
 SEARCH_PX = 1280
 """Longer side [px] of the image in which the whole frame is searched."""
-_TRACK_PX = 960  # … in which the surroundings of the last place are searched
+_TRACK_PX, _TRACK_PX_OF_TAGS = 640, 960  # … in which the surroundings of the last place are searched
 _ENLARGED = 2.0  # at most
 _MARGIN = 1.0  # of the board's extent around its last place
 _KEPT_SHARE = 0.8  # fewer of the corners of the last frame: the whole frame is searched
-_FULL_EVERY = 8  # frames without a board between searches at full resolution, or by every method
+_FULL_EVERY = 8  # frames without a board between searches at full resolution
+_MOST_GROUPS = 4  # of saddle points, searched at each level
 
 
 class BoardDetector:
@@ -61,10 +63,9 @@ class BoardDetector:
         """Numbers and pixels of the corners in the next image (H, W) of this camera."""
         corners = self._search_nearby(grey)
         if corners is None:
-            thorough = self._missed % _FULL_EVERY == 0
-            corners = self._search(grey, (0, 0, grey.shape[1], grey.shape[0]), SEARCH_PX, thorough)
-            if not len(corners[0]) and thorough and max(grey.shape) > SEARCH_PX:
-                corners = self._finder.find(grey)
+            finest = self._missed % _FULL_EVERY == 0 and max(grey.shape) > SEARCH_PX
+            search = self._search_saddles if self._board.kind == "chessboard" else self._search_whole
+            corners = search(grey, finest)
         found = len(corners[0]) > 0
         if found and self._board.symmetric:
             corners = corners[0], self._as_before(corners[1])
@@ -80,16 +81,40 @@ class BoardDetector:
         self._order = pixels
         return pixels
 
+    def _search_whole(self, grey: Grey, finest: bool) -> Corners:
+        """The corners in the reduced image, and where none are and ``finest``, in the full one."""
+        corners = self._search(grey, (0, 0, grey.shape[1], grey.shape[0]), SEARCH_PX, False)
+        return self._finder.find(grey) if finest and not len(corners[0]) else corners
+
+    def _search_saddles(self, grey: Grey, finest: bool) -> Corners:
+        """The corners of a chessboard around the groups of saddle points of a pyramid; finest: and of one more level.
+
+        OpenCV's finders take seconds for an image with much texture and no board.
+        """
+        rows, columns = (count - 1 for count in self._board.squares or (0, 0))
+        for longest in (SEARCH_PX, SEARCH_PX // 2, *([2 * SEARCH_PX] if finest else [])):
+            scale = min(longest / max(grey.shape), 1.0)
+            level = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            for low, high in linked_saddles(level, max(rows * columns // 2, 4))[:_MOST_GROUPS]:
+                corners = self._search_around(grey, low / scale, high / scale, longest <= SEARCH_PX)
+                if len(corners[0]):
+                    return corners
+        return NOTHING
+
     def _search_nearby(self, grey: Grey) -> Corners | None:
         """The corners around the last place; None if that is not known, or too few are there."""
         if self._last is None:
             return None
-        low, high = self._last.min(axis=0), self._last.max(axis=0)
+        corners = self._search_around(grey, self._last.min(axis=0), self._last.max(axis=0), False)
+        return corners if len(corners[0]) >= max(_KEPT_SHARE * len(self._last), 1.0) else None
+
+    def _search_around(self, grey: Grey, low: Floats, high: Floats, thorough: bool) -> Corners:
+        """The corners in the surroundings of a box from low (2,) to high (2,)."""
         reach = _MARGIN * max(float((high - low).max()), 60.0)
         x, y = np.maximum(np.floor(low - reach), 0).astype(int).tolist()
         right, bottom = np.minimum(np.ceil(high + reach), [grey.shape[1], grey.shape[0]]).astype(int).tolist()
-        corners = self._search(grey, (x, y, right, bottom), _TRACK_PX, False)
-        return corners if len(corners[0]) >= max(_KEPT_SHARE * len(self._last), 1.0) else None
+        most = _TRACK_PX if self._board.kind == "chessboard" else _TRACK_PX_OF_TAGS
+        return self._search(grey, (x, y, right, bottom), most, thorough)
 
     def _search(self, grey: Grey, box: tuple[int, int, int, int], most: int, thorough: bool) -> Corners:
         """The corners in a part x, y, right, bottom of the image, reduced to ``most`` pixels."""

@@ -14,7 +14,7 @@ from protocols.geometry.types import Floats, Ints
 Grey = npt.NDArray[np.uint8]
 Corners = tuple[Ints, Floats]
 """Numbers (n,) of the corners, and their pixels (n, 2). A corner's number is its place in ``Finder.labels``."""
-_NOTHING: Corners = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+NOTHING: Corners = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
 _SUBPIX_LEAST, _SUBPIX_MOST = 2, 9  # px: half window
 _SUBPIX_SHARE, _SUBPIX_SHARE_OF_TAGS = 0.4, 0.12  # of the distance of neighbouring corners; tags are in between
 _MOST_CHANGE = 0.4  # of the step between corners to the next: a board seen from 5 squares away, tilted by 60 degrees
@@ -36,7 +36,7 @@ class Finder:
     def find(self, grey: Grey, *, thorough: bool = False) -> Corners:
         """The corners in an image (H, W) uint8. thorough: search a chessboard by every method."""
         if min(grey.shape) < 24:
-            return _NOTHING
+            return NOTHING
         print_ = np.asarray(255 - grey if self.board.inverted else grey, dtype=np.uint8)
         if self.board.mirrored:
             print_ = np.ascontiguousarray(print_[:, ::-1])
@@ -85,7 +85,7 @@ class Finder:
         assert self._charuco is not None
         corners, ids, _, _ = self._charuco.detectBoard(grey)
         if ids is None or not len(ids):
-            return _NOTHING
+            return NOTHING
         return np.asarray(ids, dtype=np.int64).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
 
     def _find_tags(self, grey: Grey) -> Corners:
@@ -98,7 +98,7 @@ class Finder:
                 continue  # not of this grid
             numbers += [self._number(label) for label in labels]
             pixels.append(np.asarray(quad, dtype=np.float64).reshape(4, 2))
-        return (np.array(numbers, dtype=np.int64), np.concatenate(pixels)) if numbers else _NOTHING
+        return (np.array(numbers, dtype=np.int64), np.concatenate(pixels)) if numbers else NOTHING
 
     def _find_chessboard(self, grey: Grey, thorough: bool) -> Corners:
         assert self.board.squares is not None
@@ -121,7 +121,7 @@ class Finder:
             pixels = refined.reshape(inner[1], inner[0], 2)
             if _is_regular(pixels):
                 return numbers, _ordered(grey, pixels).reshape(-1, 2)
-        return _NOTHING
+        return NOTHING
 
     def _mirrored(self, numbers: Ints) -> Ints:
         """The places on the sheet of a mirrored print's corners: its columns are exchanged."""

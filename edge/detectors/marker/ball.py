@@ -26,8 +26,6 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.sphere_projection import outline_to_centre
 from protocols.geometry.types import Bools, Floats
 
-REVISION = 4
-"""Revision of the measurement: stored detections of another revision are not reused."""
 _STEP = 2  # of the coarse pass [px]
 _CANDIDATES = 6  # blobs that are measured, largest first
 _MIN_AREA = 6.0  # px²: smaller blobs may be colour noise

@@ -143,7 +143,7 @@ def _solve(given: _Input, report: Progress, shared_clock: bool) -> BodySolution:
             0,
             not shared_clock,
             # Rolling shutters bend what is seen of a moving board, as unknown lenses do.
-            tuple(given.free_lens[name] and given.rig.cameras[name].readout is None for name in names),
+            tuple(given.rig.cameras[name].readout is None for name in names),
             tuple(np.ones(len(one.view), dtype=np.bool_) for one in views),
             len(given.rig.bodies) == 1 and len(given.labels) >= _MIN_SHAPE_POINTS,
         )

@@ -176,11 +176,6 @@ class NodeHost:
         """Cameras whose nodes run here."""
         return sorted(self._hosted)
 
-    def host_of(self, camera: str) -> str:
-        """The hub that runs a camera's node according to the latest state; "" if none."""
-        state = self._states.get(camera)
-        return "" if state is None else state.host
-
     def poses(self) -> dict[str, Pose]:
         """Poses of all cameras that have been in the most common frame long enough, wherever they are hosted."""
         states = {c: state_from_wire(m) for c, m in sorted(self._states.items()) if not m.leaving}

@@ -12,7 +12,7 @@ import numpy as np
 
 from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, VELOCITY
-from hub.tracking.filter.target_models import PERSON, TARGET_MODELS
+from hub.tracking.filter.target_models import TARGET_MODELS
 from protocols.geometry.types import Bools, Floats, Ints
 
 MEASUREMENT_DIM = 7
@@ -155,8 +155,3 @@ def measurements_of(frame: FrameDetections, detection: Ints) -> tuple[Floats, Fl
     for row in range(2, 6):
         noise[:, row, row] = 2.0 * pixel2
     return value, noise
-
-
-def expected_size(kind: str, units_per_m: float) -> float:
-    """The typical size of a target of a kind [world units]."""
-    return units_per_m * next((model.size_m for model in TARGET_MODELS if model.kind == kind), PERSON.size_m)

@@ -209,6 +209,26 @@ def test_a_grid_with_the_margin_for_a_column_is_searched_again_by_another_method
     assert np.abs(np.sort(pixels, axis=0) - np.sort(true.reshape(-1, 2), axis=0)).max() < 0.1
 
 
+def test_a_chessboard_is_searched_only_where_saddle_points_are_linked_as_its_corners_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (720, 1280), dtype=np.uint8)
+    texture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
+    with_board = texture.copy()
+    with_board[300:460, 700:900] = cv2.resize(boards.chessboard_image(), (200, 160), interpolation=cv2.INTER_AREA)
+    searched, sector = [], cv2.findChessboardCornersSB
+    monkeypatch.setattr(
+        cv2, "findChessboardCornersSB", lambda image, *a, **k: searched.append(image.shape) or sector(image, *a, **k)
+    )
+    board = Board("chessboard", (8, 6), inverted=False)
+    assert not len(BoardDetector(board).find(texture)[0])
+    assert not searched
+    _, pixels = BoardDetector(board).find(with_board)
+    assert np.abs(pixels.min(axis=0) - [739.5, 339.5]).max() < 0.5
+    assert np.abs(pixels.max(axis=0) - [859.5, 419.5]).max() < 0.5
+    assert all(height < 400 for height, _ in searched)
+
+
 def test_tags_of_two_pixels_a_bit_are_read_and_leave_the_corners_next_to_them_alone() -> None:
     errors = _corner_errors("charuco", 170.0)
     assert len(errors) > 200

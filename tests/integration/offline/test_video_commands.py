@@ -23,6 +23,7 @@ from edge.devices.playback.video_reader import VideoReader
 from edge.offline.detections import HEADER
 from edge.scenes.marker.scene import MarkerScene
 from protocols.geometry.types import Floats
+from tests.support.sounds import add_sound, heard, sound_events
 from tests.support.videos import Image, numbered_image, read_number, record_scene_videos, write_video
 
 Capture = pytest.CaptureFixture[str]
@@ -363,3 +364,36 @@ def test_two_cameras_without_lenses_are_synchronised_by_timing_alone(
         for row in rows(tmp_path / made / "cam1.csv"):
             expected = with_poses["clock_rate"] * float(row["time"]) + with_poses["time_offset"]
             assert abs(float(row["reference_time"]) - expected) < 0.005
+
+
+def test_videos_in_which_nothing_moves_are_synchronised_by_their_sounds(tmp_path: Path, capsys: Capture) -> None:
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    still = np.full((64, 96, 3), 90, np.uint8)
+    for name, lag, seed in (("a", 0.0, 1), ("b", 3.7, 2)):
+        write_video(tmp_path / "silent.mp4", [still] * 60, np.arange(60) / 3.0)
+        sound = heard(sound_events(30.0, 5), lag, np.random.default_rng(seed), 20.0, 0.3)
+        add_sound(tmp_path / "silent.mp4", sound, folder / f"{name}.mp4")
+    assert run(["sync", str(folder), "--videos", "none", "--out", str(tmp_path / "out")]) == 0
+    assert "b: lag +3.7" in capsys.readouterr().out
+    for row in rows(tmp_path / "out" / "b.csv"):
+        assert float(row["reference_time"]) - float(row["time"]) == pytest.approx(3.7, abs=0.05)
+
+
+@pytest.mark.parametrize("late", [0.0, 2.0])
+def test_lags_of_the_images_are_compared_with_those_of_the_sounds(
+    recorded: RecordedVideos, tmp_path: Path, late: float
+) -> None:
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    shutil.copy(recorded.folder / "rig.toml", folder)
+    clocks = toml(recorded.out / "calibration.toml")
+    seconds = float(recorded.times["cam0"][-1])
+    for seed, name in enumerate(("cam0", "cam1")):
+        behind = float(clocks[name]["time_offset"]) + late * seed
+        sound = heard(sound_events(seconds + 10.0, 5) - [5.0, 0.0], behind, np.random.default_rng(seed), seconds, 0.1)
+        add_sound(recorded.folder / f"{name}.mp4", sound, folder / f"{name}.mp4")
+    assert run(["calibrate", str(folder), "--detector", "marker", "--out", str(tmp_path / "out")]) == 0
+    warnings = json.loads((tmp_path / "out" / "result.json").read_text())["warnings"]
+    line = next(text for text in warnings if text.startswith("lags by the images less those by the sound tracks"))
+    assert ("more than sound explains" in line) == (late > 0.0)

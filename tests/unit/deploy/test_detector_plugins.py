@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
+from deploy.offline import video_folder
 from deploy.offline.video_folder import session_from_videos
 from edge.agents.camera import detection_message
 from edge.detectors.plugins import load_detector
@@ -52,6 +53,21 @@ def test_a_folder_of_videos_is_a_session_until_the_network_changes(videos: Path,
     network(tmp_path / "net", TWO)
     changed = session_from_videos(videos, tmp_path / "session", detector=str(file))
     assert "a.mp4: 2 targets in it, and who is who in two videos is not known; left out" in changed.warnings
+
+
+def test_another_version_of_a_detector_detects_again(
+    videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = str(network(tmp_path / "net", ONE))
+    source = tmp_path / "program" / "base.py"
+    source.parent.mkdir()
+    monkeypatch.setattr(video_folder.detector_base, "__file__", str(source))
+    for text, kept in (("a = 1", False), ("a = 1", True), ("a = 2", False)):
+        source.write_text(text)
+        video_folder._program.cache_clear()
+        made = session_from_videos(videos, tmp_path / "session", detector=file)
+        assert ["kept from before" in line for line in made.summaries] == [kept, kept]
+    video_folder._program.cache_clear()
 
 
 def test_calibrate_refuses_what_is_no_detector(

@@ -71,13 +71,16 @@ def test_lenses_are_estimated_from_the_same_views_with_their_stds() -> None:
         assert np.abs(centre).max() < 4.0 * axis
 
 
-def test_the_readout_of_rolling_shutters_is_estimated_and_leaves_the_lenses_alone() -> None:
+@pytest.mark.parametrize("lenses", [False, True])
+def test_the_readout_of_rolling_shutters_is_estimated_and_leaves_lenses_and_lags_alone(lenses: bool) -> None:
     world = board_world(6, (10.0, 10.0))
-    found = calibrate(world.rig(lenses=False), world.observations(8.0, readout=0.015))
+    found = calibrate(world.rig(lenses=lenses), world.observations(8.0, readout=0.015))
+    off = errors(world, found)
     for name, camera in found.cameras.items():
+        assert abs(off[name][2]) <= 4.0 * camera.lag_std
         assert 0.0 < camera.readout_std < 0.001
         assert abs(camera.readout - 0.015) < 4.0 * camera.readout_std
-        assert abs(camera.intrinsics.focal / world.cameras[name].lens.focal - 1.0) < 4.0 * camera.focal_std
+        assert abs(camera.intrinsics.focal / world.cameras[name].lens.focal - 1.0) <= 4.0 * camera.focal_std
 
 
 def test_time_errors_of_single_frames_are_estimated() -> None:
