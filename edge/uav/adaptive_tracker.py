@@ -26,6 +26,7 @@ _AGREE, _CONTRADICT = 0.35, 0.7  # distance of the two estimates, in target leng
 _FRAMES_TO_TRUST, _FRAMES_TO_DROP = 20, 6  # consecutive frames of agreement, contradiction
 _HIDDEN_FRAMES = 3  # frames without the target after which an untrusted ground is given up
 _CHECK_EVERY = 3  # frames between two looks of the appearance tracker while the ground is trusted
+_CALM = 0.5  # step in the image, in target lengths, above which the appearance tracker looks at every frame
 _COMPLETE = 0.9  # share of a box in the image from which the appearance can learn it
 _RETRY_S = 4.0  # after which the ground is tried again; doubles each time
 _ATTITUDE = "the attitude says that the camera looks down"
@@ -53,6 +54,7 @@ class AdaptiveTracker:
         self._hidden = 0  # consecutive frames in which an untrusted ground could not be compared
         self._shift = np.zeros(2)  # of the box seen by appearance from the ground's estimate [px]
         self._sides: Floats | None = None
+        self._place = np.full(2, np.nan)  # of the ground's last estimate [px]
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
@@ -85,7 +87,9 @@ class AdaptiveTracker:
             return self._complete(image, ground, time)
         trusted = self._trust >= 1.0
         agreed = ground.state is TrackState.VISIBLE and self._appearance.sees
-        if trusted and self._frame % _CHECK_EVERY and agreed:
+        place, self._place = self._place, np.array([ground.x, ground.y])
+        calm = bool(np.hypot(*(self._place - place)) < _CALM * max(ground.width, ground.height))
+        if trusted and self._frame % _CHECK_EVERY and agreed and calm:
             return self._on_ground(self._corrected(ground))
         if trusted:
             self._appearance.expect(ground)
@@ -149,6 +153,9 @@ class AdaptiveTracker:
 
     def _compare(self, ground: Estimate, seen: Estimate, time: float) -> None:
         """Evidence for and against the ground, from a frame in which the appearance is certain of the target."""
+        if not self._appearance.follows:
+            self._ground, self._retry_at = None, time + self._retry_s
+            return
         if seen.state is not TrackState.VISIBLE and self._trust < 1.0:
             # Whether it would have held is not known, and two searches would cost twice.
             self._hidden += 1

@@ -69,8 +69,7 @@ class Candidate:
         self.moved = linear @ self.moved
         self.origin = motion.at(self.box.centre, reach)
         speed = self.moved / self.time if self.time else self.expected.velocity * 0.0
-        moved = self.box.at(self.origin + speed * dt).sized(self.box.sides * motion.zoom)
-        self.box = moved.turned(float(np.arctan2(linear[1, 0], linear[0, 0])))
+        self.box = motion.moved(self.box.at(self.origin + speed * dt))
 
     def add(self, box: OrientedBox, evidence: float, dt: float) -> None:
         """Add one frame: where it was found, and its log likelihood ratio.

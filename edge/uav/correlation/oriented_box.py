@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.special import ndtr
 
 from edge.uav.base import Box, Image
 from protocols.geometry.types import Floats
@@ -70,11 +71,10 @@ class OrientedBox:
         high = np.minimum(self.centre + half, np.array(size) - 0.5)
         return float(np.prod(np.clip(high - low, 0.0, None)) / np.prod(2.0 * half))
 
-    def share_within(self, reach: Floats, size: tuple[int, int]) -> float:
-        """Share of the rectangle within ``reach`` (2,) of the centre that lies in an image of this size."""
-        low = np.maximum(self.centre - reach, 0.0)
-        high = np.minimum(self.centre + reach, np.array(size) - 1.0)
-        return float(np.prod(np.clip(high - low, 0.0, None)) / np.prod(2.0 * reach))
+    def probability_inside(self, std: float, size: tuple[int, int]) -> float:
+        """Probability that the centre lies in an image of this size; std: of it, one coordinate [px]."""
+        low, high = -self.centre / std, (np.array(size) - 1.0 - self.centre) / std
+        return float(np.prod(ndtr(high) - ndtr(low)))
 
 
 def crop(image: Image, box: OrientedBox, size: tuple[int, int]) -> Image:

@@ -18,17 +18,19 @@ from protocols.geometry.types import Floats
 
 _MARGIN = 1.0  # log odds by which a place must exceed the next best one, and the one under test
 _ANYWHERE_RATE = 0.01  # at which a target is not near its prediction any more [1/s]
-_PROPOSED = -2.0  # log prior of a place that another tracker has found
+_PROPOSED = 1.0  # log prior of a place that another tracker has found
 _PROMISING = 0.0  # log odds of a place under test above which others are searched about the prediction only
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
 _MOST_TESTED, _RIVAL_MARGIN = 2, 2.0  # places that are tested at once; log odds within which one is a rival
 _DETECTION = 0.25  # probability that one search finds a target in view
+_HIDDEN = 0.1  # probability that it is in view, but behind something, for as long as it is away
 _CHANGE = 0.1  # std of the similarity of a target that has been away
 _MIN_INSIDE = 0.6  # share of a place in the image
 _TRIAL_SIZES = (0.9, 1.1)
 _FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
 _SIZES = (1.0, 0.87, 1.15, 0.75, 1.33)
-_ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1, 0.0, 1.57)
+_UPRIGHT = float("nan")  # as in the first image, however it had turned: most targets only seem to turn
+_ANGLES = (0.0, _UPRIGHT, 0.35, 0.0, -0.35, _UPRIGHT, 0.7, 0.0, -0.7, _UPRIGHT, 1.1, 0.0, -1.1, _UPRIGHT, 1.57)
 
 Localise = Callable[[Image, OrientedBox], tuple[OrientedBox, Response]]
 
@@ -50,6 +52,7 @@ class Redetection:
     def __init__(self, size: tuple[int, int], memory: TemplateMemory, localise: Localise) -> None:
         self._size, self._memory, self._localise = size, memory, localise
         self._near = 1.0
+        self._inside, self._unnoticed = 0.0, 1.0  # probability that it is in the image, and that it was not seen there
         self._tested: list[Candidate] = []
         self._proposals, self._proposal_at = (
             0,
@@ -89,13 +92,13 @@ class Redetection:
     def _search(self, image: Image, expected: Prediction, dt: float) -> None:
         """Take up the likeliest new place: in turn about the prediction, and in one tile after the other."""
         box, turn = expected.box, expected.frames // 2
-        box = box.sized(box.sides * _SIZES[turn % len(_SIZES)]).turned(_ANGLES[turn % len(_ANGLES)])
+        angle = _ANGLES[turn % len(_ANGLES)]
+        box = box.sized(box.sides * _SIZES[turn % len(_SIZES)]).turned(-box.angle if np.isnan(angle) else angle)
         reach = 3.0 * expected.std + 0.3 * box.sides
         if expected.frames % 2:
             box, reach = tile(box, self._size, turn)
         else:
-            # Where it was expected and is not seen, it is less and less likely to be.
-            self._near *= 1.0 - _DETECTION * box.share_within(reach, self._size)
+            self._find_nothing(expected)
         new = [f for f in search(image, self._memory, box, reach) if not any(c.covers(f.box) for c in self._tested)]
         if not new:
             return
@@ -108,6 +111,14 @@ class Redetection:
                 candidate = Candidate(new[k].box, priors[k], expected.motion)
                 if self._test(image, candidate, expected, dt):
                     self._tested.append(candidate)
+
+    def _find_nothing(self, expected: Prediction) -> None:
+        """Where it was expected and is not seen, it is less and less likely to be; beyond the border it can be."""
+        before, self._inside = self._inside, expected.box.probability_inside(expected.std, self._size)
+        entered = max(self._inside - before, 0.0)
+        unnoticed = (min(self._inside, before) * self._unnoticed + entered) / max(self._inside, 1e-6)
+        self._unnoticed = max((1.0 - _DETECTION) * unnoticed, _HIDDEN)
+        self._near = 1.0 - self._inside * (1.0 - self._unnoticed)
 
     def _log_prior(self, place: Floats, expected: Prediction) -> float:
         """Log probability that the target is in the box about ``place`` (2,): near the prediction, or anywhere."""
@@ -133,4 +144,4 @@ class Redetection:
         evidence = self._memory.log_ratio(score, _CHANGE, answer.log_ratio)
         candidate.add(box, evidence, dt)
         self.debug |= {"score": score, "llr": evidence, "ratio": answer.ratio, "prior": candidate.prior}
-        return evidence > 0.0 and box.share_inside(self._size) > _MIN_INSIDE and not candidate.hopeless
+        return candidate.evidence > 0.0 and box.share_inside(self._size) > _MIN_INSIDE and not candidate.hopeless

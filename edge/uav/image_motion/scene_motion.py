@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.uav.base import Image
+from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.image_motion.keyframe import Keyframe
 from protocols.geometry.types import Bools, Floats
 
@@ -49,6 +50,10 @@ class Motion:
     def zoom(self) -> float:
         """Change of scale."""
         return float(np.hypot(self.matrix[0, 0], self.matrix[1, 0]))
+
+    def moved(self, box: OrientedBox) -> OrientedBox:
+        """A box turned and sized with the scene, about the same centre."""
+        return box.sized(box.sides * self.zoom).turned(float(np.arctan2(self.matrix[1, 0], self.matrix[0, 0])))
 
     def at(self, point: Floats, reach: float) -> Floats:
         """Where the static scene at ``point`` (2,) [px] has moved, with the parallax of the tracks within ``reach``."""
