@@ -7,6 +7,7 @@ the region in which it can be is searched. No lens and no telemetry are used.
 
 from __future__ import annotations
 
+import math
 from copy import copy
 
 import numpy as np
@@ -31,6 +32,7 @@ _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
+_WINDOW = 1.2  # half of the region that the filter sees, in target lengths
 _MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
 _UNKNOWN_STEP = 0.1  # std of a step of the scene that could not be measured, over the image's width
 _FAST_PAN_S = 1.0  # in which a step in the image may be the camera's; over plain water or sky it is the target's
@@ -172,7 +174,7 @@ class AppearanceTracker:
             self._turn_rate *= float(np.exp(-dt / 0.7))
             box = box.turned(angle)
             # A similarity to the whole scene is coarser than the chain with its parallax, as long as that holds.
-            if self._broken and self._searching and self._missed % _RELOCATE_EVERY == 0:
+            if self._broken and self._searching and self._missed % _RELOCATE_EVERY == 1:
                 relocated = self._relocated()
                 if relocated is not None:
                     box, origin, self._broken = relocated, relocated.centre, False
@@ -227,12 +229,14 @@ class AppearanceTracker:
         ratio = self._ratio = self._memory.tracking_ratio(score) + answer.log_ratio
         if self._support is not None and np.hypot(*(box.centre - self._support)) < _SUPPORT_WITHIN * self.length:
             ratio += _SUPPORT
+        # It can only be there if it is in the filter's window at all.
+        self._belief.doubt(math.erf(_WINDOW * self.length / self._motion_filter.std / math.sqrt(2.0)) ** 2)
         self._belief.add(ratio, dt)
         self.debug = {"peak": peak, "ratio": answer.ratio, "score": score, "llr": ratio, "b": self._belief.log_odds}
         if self._belief.visible:
             self._accept(image, box, score, peak, dt)
         else:
-            self._searching = self._belief.gone
+            self._searching = self._belief.gone or self._motion_filter.std > self.length
             self._miss(dt)
         if self._frame % _OBSERVE_EVERY == 0:
             self._observe_background(image, box)

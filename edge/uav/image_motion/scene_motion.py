@@ -26,6 +26,7 @@ _MAX_TRACKS = 120
 _LK_WINDOW, _LK_LEVELS = 13, 3
 _BACKWARD_PX = 0.7  # forward-backward distance of a good track [px of the working image]
 _RANSAC_PX = 1.5  # residual of a track of the static scene [px of the working image]
+_BENT = 0.04  # of the shift by a turn: mean of (x/f)^2 over half an image as wide as its focal length
 _MIN_TRACKS, _MIN_SHARE = 12, 0.35  # of a trusted motion: static tracks, and their share
 _PARTS, _VOTE_PX = (4, 2), 2  # parts that are searched after a fast pan; agreement of their shifts [px, reduced]
 _PARALLAX_PX = 6.0  # largest correction [px of the working image]
@@ -124,15 +125,18 @@ class SceneMotion:
     def _fit(self, old: Floats, new: Floats) -> Motion:
         if len(old) < _MIN_TRACKS:
             return STILL
+        # A turn of the camera moves the image by a homography: what it bends is a share of the shift.
+        tolerance = 1.0 + _BENT * float(np.median(np.hypot(*(new - old).T))) / _RANSAC_PX
+        limit = tolerance * _RANSAC_PX
         matrix, inlier = cv2.estimateAffinePartial2D(
-            old, new, method=cv2.RANSAC, ransacReprojThreshold=_RANSAC_PX, maxIters=300, confidence=0.995
+            old, new, method=cv2.RANSAC, ransacReprojThreshold=limit, maxIters=300, confidence=0.995
         )
         if matrix is None:
             return STILL
         mask: Bools = inlier.ravel() > 0
         share = float(mask.mean())
         residual = new - (old @ matrix[:, :2].T + matrix[:, 2])
-        near = np.square(residual).sum(axis=1) < _PARALLAX_PX**2
+        near = np.square(residual).sum(axis=1) < (tolerance * _PARALLAX_PX) ** 2
         zoom = float(np.hypot(matrix[0, 0], matrix[1, 0]))
         trusted = bool(int(mask.sum()) >= _MIN_TRACKS and share > _MIN_SHARE and 0.5 < zoom < 2.0)
         full = self._to_full(np.asarray(matrix, np.float64))
