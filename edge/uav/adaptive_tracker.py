@@ -95,7 +95,8 @@ class AdaptiveTracker:
             self._appearance.expect(ground)
         seen = self._appearance.handle_frame(image, time)
         self._compare(ground, seen, time)
-        if self._ground is None or self._trust < 1.0:
+        alone = seen.state is TrackState.VISIBLE and ground.state is not TrackState.VISIBLE
+        if self._ground is None or self._trust < 1.0 or alone:
             return self._on_image(seen)
         if ground.state is TrackState.VISIBLE and seen.state is not TrackState.VISIBLE:
             coasting = replace(ground, state=TrackState.COASTING, std=max(ground.std, seen.std))

@@ -192,8 +192,11 @@ class AppearanceTracker:
         self._support = box.centre if found else None
         if self._missed and found:
             turn = expected.heading - self._heading
+            box = box.turned(turn if np.isfinite(turn) else 0.0)
             if self._searching:
-                self._redetection.propose(box.turned(turn if np.isfinite(turn) else 0.0), self._prediction())
+                self._redetection.propose(box, self._prediction())
+            else:
+                self.box = box
         elif self._missed or not self.motion.trusted:
             # One that jumps over the scene has lost it, if most of the scene moves alike.
             clear = self.motion.trusted and self.motion.share > _MOST_OF_SCENE

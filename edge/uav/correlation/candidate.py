@@ -15,7 +15,7 @@ _TENTATIVE = -3.0  # log odds below which a place is not tested further
 _MAX_TESTS = 8  # frames for which a place is tested
 _HITS = 3  # consecutive frames of a re-detection
 _PLACE_STD = 0.05  # of a place measured twice, in target lengths
-_KEEPS, _TURNS, _STOPS = 0.75, 0.15, 0.1  # probabilities of what a target has done while away
+KEEPS, _TURNS, _STOPS = 0.75, 0.15, 0.1  # probabilities of what a target has done while away
 _STOOD = 0.3  # speed below which it stood and may go on to, in lengths a second
 _STILL, _STILL_STD = 0.5, 0.1  # share of the look-alikes that stand, and std of their speed, in lengths a second
 _SLOWEST = 0.35  # std of the velocity of what moves, at least, one coordinate, in lengths a second
@@ -38,8 +38,8 @@ class Kinematics:
         keeps = _normal(velocity - self.velocity, np.hypot(self.std, std))
         moves = _normal(velocity, np.hypot(wide, std))
         stands = _normal(velocity, np.hypot(_STILL_STD * self.length, std))
-        stood = 0.5 * _KEEPS * np.exp(-0.5 * np.square(self.velocity).sum() / (_STOOD * self.length) ** 2)
-        target = (_KEEPS - stood) * keeps + _TURNS * moves + (_STOPS + stood) * stands
+        stood = 0.5 * KEEPS * np.exp(-0.5 * np.square(self.velocity).sum() / (_STOOD * self.length) ** 2)
+        target = (KEEPS - stood) * keeps + _TURNS * moves + (_STOPS + stood) * stands
         return float(np.log(target + 1e-300) - np.log(_STILL * stands + (1.0 - _STILL) * moves + 1e-300))
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.uav.base import Image
-from edge.uav.correlation.candidate import Candidate, Kinematics
+from edge.uav.correlation.candidate import KEEPS, Candidate, Kinematics
 from edge.uav.correlation.filter import Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -17,6 +17,7 @@ from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats
 
 _MARGIN = 1.0  # log odds by which a place must exceed the next best one, and the one under test
+_MANOEUVRE = 3.0  # acceleration of what brakes, turns or sets off, in lengths a second squared; a car that starts
 _ANYWHERE_RATE = 0.01  # at which a target is not near its prediction any more [1/s]
 _PROPOSED = 1.0  # log prior of a place that another tracker has found
 _PROMISING = 0.0  # log odds of a place under test above which others are searched about the prediction only
@@ -45,6 +46,11 @@ class Prediction:
     frames: int
     seconds: float
 
+    @property
+    def wide(self) -> float:
+        """Std of its centre if it turns, brakes or sets off, one coordinate [px]."""
+        return float(np.hypot(self.std, 0.5 * _MANOEUVRE * self.motion.length * self.seconds**2))
+
 
 class Redetection:
     """One absence. size: of the images [px]; localise: the box and the answer of the target's filter about a box."""
@@ -67,8 +73,11 @@ class Redetection:
 
     def propose(self, box: OrientedBox, expected: Prediction) -> None:
         """Test a place that another tracker has found."""
-        if expected.frames >= self._proposal_at and not any(c.covers(box) for c in self._tested):
-            prior = float(np.logaddexp(self._log_prior(box.centre, expected), _PROPOSED))
+        prior = float(np.logaddexp(self._log_prior(box.centre, expected), _PROPOSED))
+        same = [c for c in self._tested if c.covers(box)]
+        for candidate in same:
+            candidate.prior = max(candidate.prior, prior)
+        if expected.frames >= self._proposal_at and not same:
             self._tested.append(Candidate(box, prior, expected.motion))
             # A wrong one must not leave no time for the search.
             self._proposals += 1
@@ -94,7 +103,7 @@ class Redetection:
         box, turn = expected.box, expected.frames // 2
         angle = _ANGLES[turn % len(_ANGLES)]
         box = box.sized(box.sides * _SIZES[turn % len(_SIZES)]).turned(-box.angle if np.isnan(angle) else angle)
-        reach = 3.0 * expected.std + 0.3 * box.sides
+        reach = max(3.0 * expected.std, 2.0 * expected.wide) + 0.3 * box.sides
         if expected.frames % 2:
             box, reach = tile(box, self._size, turn)
         else:
@@ -123,11 +132,14 @@ class Redetection:
     def _log_prior(self, place: Floats, expected: Prediction) -> float:
         """Log probability that the target is in the box about ``place`` (2,): near the prediction, or anywhere."""
         area = expected.box.width * expected.box.height
-        variance = expected.std**2
-        squared = float(np.square(place - expected.box.centre).sum()) / variance
         share = self._near / (self._near + 1.0 - np.exp(-_ANYWHERE_RATE * expected.seconds))
-        # Student's t with two degrees of freedom: what turns or brakes leaves the Gaussian.
-        near = np.log(share + 1e-12) - 2.0 * np.log1p(0.5 * squared) + np.log(min(area / (2.0 * np.pi * variance), 1.0))
+        squared = float(np.square(place - expected.box.centre).sum())
+        near = np.log(share + 1e-12) + float(
+            np.logaddexp(
+                np.log(KEEPS) + _log_density(squared, expected.std, area),
+                np.log(1.0 - KEEPS) + _log_density(squared, expected.wide, area),
+            )
+        )
         return float(np.logaddexp(near, np.log((1.0 - share) * area / (self._size[0] * self._size[1]))))
 
     def _test(self, image: Image, candidate: Candidate, expected: Prediction, dt: float) -> bool:
@@ -145,3 +157,11 @@ class Redetection:
         candidate.add(box, evidence, dt)
         self.debug |= {"score": score, "llr": evidence, "ratio": answer.ratio, "prior": candidate.prior}
         return candidate.evidence > 0.0 and box.share_inside(self._size) > _MIN_INSIDE and not candidate.hopeless
+
+
+def _log_density(squared: float, std: float, area: float) -> float:
+    """Log probability of a place in the box: Student's t with two degrees of freedom, for the std itself is a guess.
+
+    squared: squared distance from the prediction [px^2]; std: of the prediction, one coordinate [px]; area: of the box.
+    """
+    return float(-2.0 * np.log1p(0.5 * squared / std**2) + np.log(min(area / (2.0 * np.pi * std**2), 1.0)))
