@@ -45,7 +45,7 @@ def painted(scene: Image, place: np.ndarray, opacity: float = 1.0) -> Image:
 
 
 def test_what_the_target_was_lost_to_does_not_move_it(scene: Image) -> None:
-    """As it passes behind something that looks a little like it, a standing place, its track must go on at its speed."""
+    """Behind something that stands and looks a little like it, it must be predicted to go on at its own speed."""
     tracker = AppearanceTracker(SIZE, FPS)
     start, step = np.array([60.0, 120.0]), np.array([3.0, 0.0])
     box = Box(*(start - 0.5 * TARGET), *map(float, TARGET))
