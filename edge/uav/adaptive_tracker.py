@@ -154,32 +154,24 @@ class AdaptiveTracker:
 
     def _compare(self, ground: Estimate, seen: Estimate, time: float) -> None:
         """Evidence for and against the ground, from a frame in which the appearance is certain of the target."""
-        if not self._appearance.follows:
-            self._ground, self._retry_at = None, time + self._retry_s
-            return
-        if seen.state is not TrackState.VISIBLE and self._trust < 1.0:
-            # Whether it would have held is not known, and two searches would cost twice.
+        found, sees = ground.state is TrackState.VISIBLE, seen.state is TrackState.VISIBLE
+        drop = not self._appearance.follows
+        if not sees and (found or self._trust < 1.0):
+            # A trusted one has found what does not look like the target. Whether another would have held is not known,
+            # and two searches would cost twice.
             self._hidden += 1
-            if self._hidden > _HIDDEN_FRAMES:
-                self._ground, self._retry_at = None, time + self._retry_s
-            return
-        if seen.state is not TrackState.VISIBLE and ground.state is TrackState.VISIBLE:
-            # It has found something that does not look like the target.
-            self._hidden += 1
-            if self._hidden > _FRAMES_TO_DROP:
-                self._ground, self._retry_at = None, time + self._retry_s
-            return
-        self._hidden = 0
-        if seen.state is not TrackState.VISIBLE or not self._appearance.certain:
-            return
-        distance = float(np.hypot(seen.x - ground.x, seen.y - ground.y))
-        length = max(seen.width, seen.height)
-        weight = _CHECK_EVERY if self._trust >= 1.0 else 1
-        if ground.state is TrackState.VISIBLE and distance < _AGREE * length + 2.0:
-            self._trust = min(self._trust + weight / _FRAMES_TO_TRUST, 1.0)
-        elif ground.state is not TrackState.VISIBLE or distance > _CONTRADICT * length + 4.0:
-            self._trust -= weight / _FRAMES_TO_DROP
-        if self._trust <= -1.0 + 1e-9:
+            drop |= self._hidden > (_HIDDEN_FRAMES if self._trust < 1.0 else _FRAMES_TO_DROP)
+        else:
+            self._hidden = 0
+            if sees and self._appearance.certain:
+                distance = float(np.hypot(seen.x - ground.x, seen.y - ground.y))
+                length = max(seen.width, seen.height)
+                weight = _CHECK_EVERY if self._trust >= 1.0 else 1
+                if found and distance < _AGREE * length + 2.0:
+                    self._trust = min(self._trust + weight / _FRAMES_TO_TRUST, 1.0)
+                elif not found or distance > _CONTRADICT * length + 4.0:
+                    self._trust -= weight / _FRAMES_TO_DROP
+        if drop or self._trust <= -1.0 + 1e-9:
             self._ground, self._retry_at = None, time + self._retry_s
 
     def _corrected(self, ground: Estimate) -> Estimate:
@@ -187,13 +179,8 @@ class AdaptiveTracker:
         if self._sides is None:
             return ground
         sides = self._sides * [ground.width, ground.height]
-        return replace(
-            ground,
-            x=ground.x + float(self._shift[0]),
-            y=ground.y + float(self._shift[1]),
-            width=float(sides[0]),
-            height=float(sides[1]),
-        )
+        x, y = ground.x + float(self._shift[0]), ground.y + float(self._shift[1])
+        return replace(ground, x=x, y=y, width=float(sides[0]), height=float(sides[1]))
 
     def _on_ground(self, estimate: Estimate) -> Estimate:
         metric = bool(np.isfinite(estimate.north)) or (self._ground is not None and self._ground.metric)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -59,17 +58,6 @@ class FrameObservation:
         against = np.cos(tangent - headings) < 0.0
         direction = np.where(against, -1.0, 1.0) if self.direction == 0 else float(self.direction)
         return distance, road_heading(tangent, direction)
-
-
-class CarModel(Protocol):
-    """States (x, y, V, theta): px, px a frame over the ground, rad. motion: of the background, into this frame."""
-
-    motion: BackgroundMotion
-    previous: FrameObservation | None
-
-    def propagate(self, states: Floats, rng: np.random.Generator) -> Floats: ...
-
-    def log_likelihood(self, states: Floats, observation: FrameObservation) -> Floats: ...
 
 
 class RoadSteeredModel:

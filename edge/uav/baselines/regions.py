@@ -37,11 +37,6 @@ class RegionStatistics:
     other_mean: Floats
     other_variance: Floats
 
-    @classmethod
-    def from_masks(cls, image: Image, road: Bools, other: Bools) -> RegionStatistics:
-        """From an image (h, w, 3) and masks (h, w) of road and other; neither may be empty."""
-        return cls(*_statistics(image[road]), *_statistics(image[other]))
-
     def adapted(self, image: Image, labels: Labels, road_core: Bools) -> RegionStatistics:
         """Exponential update from this frame's pixels within the road model and its pixels labelled other."""
         changed = self

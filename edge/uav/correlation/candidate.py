@@ -100,9 +100,9 @@ class Candidate:
         return self.prior + self.evidence + motion
 
     @property
-    def hopeless(self) -> bool:
-        """Whether further frames will hardly make it the target."""
-        return self.log_odds < _TENTATIVE or self.hits > _MAX_TESTS
+    def promising(self) -> bool:
+        """Whether further frames may make it the target."""
+        return self.evidence > 0.0 and self.log_odds >= _TENTATIVE and self.hits <= _MAX_TESTS
 
     @property
     def accepted(self) -> bool:

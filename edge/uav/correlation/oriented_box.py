@@ -12,7 +12,6 @@ from edge.uav.base import Box, Image
 from protocols.geometry.types import Floats
 
 _MAX_SHRINK = 2.0  # by linear interpolation alone; beyond, pixels are averaged first, against aliasing
-_MAX_SOURCE_PX = 4e7
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +94,7 @@ def crop(image: Image, box: OrientedBox, size: tuple[int, int]) -> Image:
 def _averaged(image: Image, box: OrientedBox, shrink: int) -> tuple[Image, Floats]:
     """The part of the image about a box, reduced by an integer, and its first pixel (2,)."""
     rows, columns = image.shape[:2]
-    c, s = abs(np.cos(box.angle)), abs(np.sin(box.angle))
-    half = 0.5 * np.array([c * box.width + s * box.height, s * box.width + c * box.height]) + 2 * shrink
+    half = 0.5 * box.extent + 2 * shrink
     limit = np.array([columns, rows]) - shrink
     low = np.clip(np.floor(box.centre - half), 0, np.maximum(limit, 0)).astype(int)
     high = np.clip(np.ceil(box.centre + half), low + shrink, [columns, rows]).astype(int)

@@ -60,10 +60,6 @@ class Redetection:
         self._near = 1.0
         self._inside, self._unnoticed = 0.0, 1.0  # probability that it is in the image, and that it was not seen there
         self._tested: list[Candidate] = []
-        self._proposals, self._proposal_at = (
-            0,
-            0,
-        )  # how many; frame of the absence from which another tracker's place is tested
         self.debug: dict[str, float] = {}
 
     def move(self, motion: Motion, reach: float, dt: float) -> None:
@@ -77,11 +73,8 @@ class Redetection:
         same = [c for c in self._tested if c.covers(box)]
         for candidate in same:
             candidate.prior = max(candidate.prior, prior)
-        if expected.frames >= self._proposal_at and not same:
+        if not same:
             self._tested.append(Candidate(box, prior, expected.motion))
-            # A wrong one must not leave no time for the search.
-            self._proposals += 1
-            self._proposal_at = expected.frames + 2 ** min(self._proposals, 4)
 
     def look(self, image: Image, expected: Prediction, dt: float) -> Candidate | None:
         """Search one image; the place that is taken for the target, if any: by its odds, and a margin over the next."""
@@ -156,7 +149,7 @@ class Redetection:
         evidence = self._memory.log_ratio(score, _CHANGE, answer.log_ratio)
         candidate.add(box, evidence, dt)
         self.debug |= {"score": score, "llr": evidence, "ratio": answer.ratio, "prior": candidate.prior}
-        return candidate.evidence > 0.0 and box.share_inside(self._size) > _MIN_INSIDE and not candidate.hopeless
+        return candidate.promising and box.share_inside(self._size) > _MIN_INSIDE
 
 
 def _log_density(squared: float, std: float, area: float) -> float:
