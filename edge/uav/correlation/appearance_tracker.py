@@ -27,7 +27,8 @@ from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
 from edge.uav.target.box import check_target_box
 from protocols.geometry.types import Floats
 
-_LEARN_INSIDE = 0.97  # share of the box in the image above which appearance, size and velocity are learnt
+_LEARN_INSIDE = 0.97  # share of the box in the image above which appearance and velocity are learnt
+_SIZE_INSIDE = 0.85  # and above which the flow in it measures its size
 _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
@@ -253,9 +254,9 @@ class AppearanceTracker:
         # Where it looks less like the target than what is beside it, it says little about how the target moves.
         unsure = 1.0 - inside if self._ratio > 0.0 else 1.0
         self._motion_filter.correct(box.centre - self.box.centre, self.length, unsure)
+        wider, higher, turn = self._flow.change(image, box.centre) if inside > _SIZE_INSIDE else (1.0, 1.0, 0.0)
+        box = box.sized(box.sides * [wider, higher]).turned(turn)
         if inside > _LEARN_INSIDE:
-            wider, higher, turn = self._flow.change(image, box.centre)
-            box = box.sized(box.sides * [wider, higher]).turned(turn)
             self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)
             if self._frame % 3 == 0:
                 box = self._anchored(image, box)

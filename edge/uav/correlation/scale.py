@@ -60,6 +60,8 @@ class BoxFlow:
         moved, ok, _ = cv2.calcOpticalFlowPyrLK(old, new, points, points.copy(), winSize=(9, 9), maxLevel=2)
         back, ok_back, _ = cv2.calcOpticalFlowPyrLK(new, old, moved, points.copy(), winSize=(9, 9), maxLevel=2)
         good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (np.square(back - points).sum(axis=1) < 1.0)
+        seen = centre + (points - middle) / per_pixel @ box.axes.T
+        good &= ((seen >= 1.0) & (seen <= np.array(image.shape[1::-1]) - 2.0)).all(axis=1)
         p, q = points[good].astype(np.float64) - middle, moved[good].astype(np.float64) - middle
         if len(p) < _MIN_POINTS:
             return none
