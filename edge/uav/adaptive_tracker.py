@@ -26,6 +26,7 @@ _AGREE, _CONTRADICT = 0.35, 0.7  # distance of the two estimates, in target leng
 _FRAMES_TO_TRUST, _FRAMES_TO_DROP = 20, 6  # consecutive frames of agreement, contradiction
 _HIDDEN_FRAMES = 3  # frames without the target after which an untrusted ground is given up
 _CHECK_EVERY = 3  # frames between two looks of the appearance tracker while the ground is trusted
+_CALM = 0.5  # step in the image, in target lengths, above which the appearance tracker looks at every frame
 _COMPLETE = 0.9  # share of a box in the image from which the appearance can learn it
 _RETRY_S = 4.0  # after which the ground is tried again; doubles each time
 _ATTITUDE = "the attitude says that the camera looks down"
@@ -53,6 +54,7 @@ class AdaptiveTracker:
         self._hidden = 0  # consecutive frames in which an untrusted ground could not be compared
         self._shift = np.zeros(2)  # of the box seen by appearance from the ground's estimate [px]
         self._sides: Floats | None = None
+        self._place = np.full(2, np.nan)  # of the ground's last estimate [px]
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
@@ -85,13 +87,16 @@ class AdaptiveTracker:
             return self._complete(image, ground, time)
         trusted = self._trust >= 1.0
         agreed = ground.state is TrackState.VISIBLE and self._appearance.sees
-        if trusted and self._frame % _CHECK_EVERY and agreed:
+        place, self._place = self._place, np.array([ground.x, ground.y])
+        calm = bool(np.hypot(*(self._place - place)) < _CALM * max(ground.width, ground.height))
+        if trusted and self._frame % _CHECK_EVERY and agreed and calm:
             return self._on_ground(self._corrected(ground))
         if trusted:
             self._appearance.expect(ground)
         seen = self._appearance.handle_frame(image, time)
         self._compare(ground, seen, time)
-        if self._ground is None or self._trust < 1.0:
+        alone = seen.state is TrackState.VISIBLE and ground.state is not TrackState.VISIBLE
+        if self._ground is None or self._trust < 1.0 or alone:
             return self._on_image(seen)
         if ground.state is TrackState.VISIBLE and seen.state is not TrackState.VISIBLE:
             coasting = replace(ground, state=TrackState.COASTING, std=max(ground.std, seen.std))
@@ -149,29 +154,24 @@ class AdaptiveTracker:
 
     def _compare(self, ground: Estimate, seen: Estimate, time: float) -> None:
         """Evidence for and against the ground, from a frame in which the appearance is certain of the target."""
-        if seen.state is not TrackState.VISIBLE and self._trust < 1.0:
-            # Whether it would have held is not known, and two searches would cost twice.
+        found, sees = ground.state is TrackState.VISIBLE, seen.state is TrackState.VISIBLE
+        drop = not self._appearance.follows
+        if not sees and (found or self._trust < 1.0):
+            # A trusted one has found what does not look like the target. Whether another would have held is not known,
+            # and two searches would cost twice.
             self._hidden += 1
-            if self._hidden > _HIDDEN_FRAMES:
-                self._ground, self._retry_at = None, time + self._retry_s
-            return
-        if seen.state is not TrackState.VISIBLE and ground.state is TrackState.VISIBLE:
-            # It has found something that does not look like the target.
-            self._hidden += 1
-            if self._hidden > _FRAMES_TO_DROP:
-                self._ground, self._retry_at = None, time + self._retry_s
-            return
-        self._hidden = 0
-        if seen.state is not TrackState.VISIBLE or not self._appearance.certain:
-            return
-        distance = float(np.hypot(seen.x - ground.x, seen.y - ground.y))
-        length = max(seen.width, seen.height)
-        weight = _CHECK_EVERY if self._trust >= 1.0 else 1
-        if ground.state is TrackState.VISIBLE and distance < _AGREE * length + 2.0:
-            self._trust = min(self._trust + weight / _FRAMES_TO_TRUST, 1.0)
-        elif ground.state is not TrackState.VISIBLE or distance > _CONTRADICT * length + 4.0:
-            self._trust -= weight / _FRAMES_TO_DROP
-        if self._trust <= -1.0 + 1e-9:
+            drop |= self._hidden > (_HIDDEN_FRAMES if self._trust < 1.0 else _FRAMES_TO_DROP)
+        else:
+            self._hidden = 0
+            if sees and self._appearance.certain:
+                distance = float(np.hypot(seen.x - ground.x, seen.y - ground.y))
+                length = max(seen.width, seen.height)
+                weight = _CHECK_EVERY if self._trust >= 1.0 else 1
+                if found and distance < _AGREE * length + 2.0:
+                    self._trust = min(self._trust + weight / _FRAMES_TO_TRUST, 1.0)
+                elif not found or distance > _CONTRADICT * length + 4.0:
+                    self._trust -= weight / _FRAMES_TO_DROP
+        if drop or self._trust <= -1.0 + 1e-9:
             self._ground, self._retry_at = None, time + self._retry_s
 
     def _corrected(self, ground: Estimate) -> Estimate:
@@ -179,13 +179,8 @@ class AdaptiveTracker:
         if self._sides is None:
             return ground
         sides = self._sides * [ground.width, ground.height]
-        return replace(
-            ground,
-            x=ground.x + float(self._shift[0]),
-            y=ground.y + float(self._shift[1]),
-            width=float(sides[0]),
-            height=float(sides[1]),
-        )
+        x, y = ground.x + float(self._shift[0]), ground.y + float(self._shift[1])
+        return replace(ground, x=x, y=y, width=float(sides[0]), height=float(sides[1]))
 
     def _on_ground(self, estimate: Estimate) -> Estimate:
         metric = bool(np.isfinite(estimate.north)) or (self._ground is not None and self._ground.metric)

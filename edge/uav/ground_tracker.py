@@ -50,10 +50,8 @@ _ROTATED_CANDIDATES = 2  # number of best candidates matched rotated, in turn
 _SAME_ANGLE_COSINE = 0.997  # above which two angles are the same
 _HEADING_STD = 0.06  # of a heading from the template [rad]
 _REDETECT_AFTER = 12  # missed frames after which the full frame is searched
-_INJECTION_RATE, _MAX_INJECTED_WEIGHT = (  # injected weight per second, and its limit, in case all paths are wrong
-    0.002,
-    0.02,
-)  # weight of injected particles per second, and its limit: the target took an unknown path
+# Weight of injected particles per second, and its limit: the target took an unknown path.
+_INJECTION_RATE, _MAX_INJECTED_WEIGHT = 0.002, 0.02
 _DETECTION_PROBABILITIES = (0.03, 0.03, 0.1, 0.3)  # per frame, with 0 to 3 of the car's test points on open road
 _END_OFFSET = 0.35  # of the outer test points from the centre, over the length
 _LOST_INJECTED_WEIGHT = 0.1  # the same limit once the target is lost

@@ -1,6 +1,7 @@
 """Any target in any view: cars, boats, bicycles and people in oblique video, also while the camera looks away.
 
-    python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique] [--json]
+    python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique]
+        [--stabilisation] [--json]
 
 Rendered oblique flights with truth, and where the data folder has them real ones: whole sequences, and windows that pan
 away from the target for 0.5 to 4 s and come back. No lens, no telemetry.
@@ -20,6 +21,7 @@ import numpy as np
 
 from edge.uav import tracker_factory
 from edge.uav.base import Box, Estimate, Tracker, TrackState
+from edge.uav.image_motion.scene_motion import SceneMotion
 from edge.uav.world.oblique.world import FLIGHTS, TARGETS, ObliqueWorld
 from protocols.geometry.types import Floats
 from tests.bench import uav_rivals
@@ -149,6 +151,36 @@ def real(data: Path, windows: bool = True) -> Iterator[Sequence]:
                 yield window
 
 
+def stabilised(sequence: Sequence) -> Floats:
+    """Distances (n,) [px] of corners off the target from where the chained image motion has them after a second.
+
+    The corners are tracked on their own at full resolution; those that move with traffic are among them.
+    """
+    motion = SceneMotion(sequence.size)
+    grays = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in sequence.images]
+    steps = []
+    for k, image in enumerate(sequence.images):
+        x, y, width, height = sequence.box[max(k - 1, 0)]
+        steps.append(motion.update(image, np.array([x, y, x + width, y + height])))
+    found, second = [], round(sequence.fps)
+    for start in range(0, len(grays) - second, second):
+        mask = np.full(grays[start].shape, 255, np.uint8)
+        x0, y0, width, height = sequence.box[start].astype(int)
+        mask[max(y0 - 5, 0) : max(y0 + height + 5, 0), max(x0 - 5, 0) : max(x0 + width + 5, 0)] = 0
+        corners = cv2.goodFeaturesToTrack(grays[start], 60, 0.01, 15, mask=mask)
+        if corners is None:
+            continue
+        tracked, kept = corners, np.ones(len(corners), bool)
+        chained = corners.reshape(-1, 2).astype(np.float64)
+        for k in range(start + 1, start + second + 1):
+            moved, ok, _ = cv2.calcOpticalFlowPyrLK(grays[k - 1], grays[k], tracked, None)
+            back, _, _ = cv2.calcOpticalFlowPyrLK(grays[k], grays[k - 1], moved, None)
+            kept &= (ok.ravel() == 1) & (np.abs(back - tracked).reshape(-1, 2).max(axis=1) < 0.5)
+            tracked, chained = moved, np.array([steps[k].at(point, motion.reach) for point in chained])
+        found.append(np.hypot(*(tracked.reshape(-1, 2) - chained)[kept].T))
+    return np.concatenate(found)
+
+
 def table(scores: list[Score]) -> str:
     """One line for each kind and model."""
     titles = ("in view", "overlap", "success", "away", "claimed", "held", "ms/frame")
@@ -175,9 +207,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="rendered flights of each kind")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
+    parser.add_argument("--stabilisation", action="store_true", help="only: how well the real videos are stabilised")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     cv2.setNumThreads(1)
+    if options.stabilisation:
+        for sequence in oblique(options.data / "oblique"):
+            half, most = np.percentile(stabilised(sequence), (50, 90))
+            print(f"{sequence.name:10s} after 1 s: half of the corners within {half:.2f} px, 90 % within {most:.2f} px")
+        return
     uav_rivals.restart_with_contrib("tests.bench.uav_any_view", options.models.split(","))
     models = [m for m in options.models.split(",") if m not in uav_rivals.NAMES or uav_rivals.available(m)]
     left_out = [m for m in options.models.split(",") if m not in models]

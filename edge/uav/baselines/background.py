@@ -60,10 +60,7 @@ class OpticalFlow:
 def predicted_flow(motions: Floats, points: Floats) -> Floats:
     """Eqs. (4.17), (4.18): u = h_x - w Y, v = h_y + w X. motions (n, 3), points (m, 2) from the centre -> (n, m, 2)."""
     x, y = points[:, 0], points[:, 1]
-    return np.stack(
-        [motions[:, :1] - motions[:, 2:] * y[None], motions[:, 1:2] + motions[:, 2:] * x[None]],
-        axis=-1,
-    )
+    return np.stack([motions[:, :1] - motions[:, 2:] * y[None], motions[:, 1:2] + motions[:, 2:] * x[None]], axis=-1)
 
 
 class MotionModel:

@@ -7,6 +7,9 @@ the region in which it can be is searched. No lens and no telemetry are used.
 
 from __future__ import annotations
 
+import math
+from copy import copy
+
 import numpy as np
 
 from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
@@ -24,10 +27,14 @@ from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
 from edge.uav.target.box import check_target_box
 from protocols.geometry.types import Floats
 
-_LEARN_INSIDE = 0.97  # share of the box in the image above which appearance, size and velocity are learnt
+_LEARN_INSIDE = 0.97  # share of the box in the image above which appearance and velocity are learnt
+_SIZE_INSIDE = 0.85  # and above which the flow in it measures its size
 _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
+_SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
+_WINDOW = 1.2  # half of the region that the filter sees, in target lengths
+_MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
 _UNKNOWN_STEP = 0.1  # std of a step of the scene that could not be measured, over the image's width
 _FAST_PAN_S = 1.0  # in which a step in the image may be the camera's; over plain water or sky it is the target's
 _MOVES = 0.3  # speed over the scene at which a heading is given, in target lengths a second
@@ -38,6 +45,7 @@ _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or 
 _ANCHOR_STEP = 0.3  # share of the way to it
 _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
 _TRIAL_SIZES = (0.9, 1.1)
+_SURE_STD = 0.5  # of where it must be since the evidence was clear, in lengths, to go back to that
 _LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
 _KEEP_EVERY = 5  # frames between two keyframes
 _RELOCATE_EVERY = 4  # frames between two attempts to recognise the scene
@@ -50,6 +58,8 @@ class AppearanceTracker:
         self._size = size
         self._fps = fps
         self._scene = SceneMotion(size)
+        self.follows = True
+        """Whether the other tracker's prediction moves with the scene."""
         self.debug: dict[str, float] = {}
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
@@ -80,7 +90,9 @@ class AppearanceTracker:
         self._redetection = Redetection(self._size, self._memory, self._respond)
         self._ratio = 0.0
         self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
-        self._expected: tuple[OrientedBox, bool] | None = None
+        self._expected: Estimate | None = None
+        self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
+        self._other_std = np.inf
         self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
         self._belief = Belief()
         self._searching = False
@@ -132,28 +144,30 @@ class AppearanceTracker:
         """Take the place where another tracker has the target in the next image: what it sees there is tested first."""
         if not self._missed:
             self._heading = other.heading
-        elif np.isfinite([other.x, other.y]).all():
-            turn = other.heading - self._heading if other.state is TrackState.VISIBLE else float("nan")
-            box = self.box.at(np.array([other.x, other.y])).turned(turn if np.isfinite(turn) else 0.0)
-            self._expected = box, other.state is TrackState.VISIBLE
+        if np.isfinite([other.x, other.y]).all():
+            self._expected = other
 
     def _predict(self, dt: float) -> Floats:
         """Move the box with the scene and its own velocity; returns where the scene alone would have moved it (2,)."""
         motion, box = self.motion, self.box
+        (sure, velocity), expected = self._sure, self._expected
+        self._support: Floats | None = None
+        self.follows, self._other_std = True, np.inf
         origin = box.centre
         if motion.trusted:
-            linear = motion.matrix[:, :2]
             self._trusted_at = self._time
             if self._missed == 0:
                 self._since_keyframe = _square(motion.matrix) @ self._since_keyframe
-            origin = motion.at(box.centre, self._scene.reach)
-            self._motion_filter.follow_scene(linear)
-            turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
+            origin, sure = motion.at(box.centre, self._scene.reach), sure.at(motion.at(sure.centre, self._scene.reach))
+            for moving in (self._motion_filter, velocity):
+                moving.follow_scene(motion.matrix[:, :2])
             if self._missed == 0:
-                box = box.sized(box.sides * motion.zoom).turned(turn)
+                box = motion.moved(box)
+            sure = motion.moved(sure)
             self._redetection.move(motion, self._scene.reach, dt)
-        elif self._missed or self._time - self._trusted_at < _FAST_PAN_S:
-            self._motion_filter.lose_scene(_UNKNOWN_STEP * self._size[0])
+        elif expected is None and (self._missed or self._time - self._trusted_at < _FAST_PAN_S):
+            for moving in (self._motion_filter, velocity):
+                moving.lose_scene(_UNKNOWN_STEP * self._size[0])
         if self._missed:
             self._broken |= not motion.trusted
             angle = self._turn_rate * dt
@@ -161,18 +175,37 @@ class AppearanceTracker:
             self._turn_rate *= float(np.exp(-dt / 0.7))
             box = box.turned(angle)
             # A similarity to the whole scene is coarser than the chain with its parallax, as long as that holds.
-            if self._broken and self._searching and self._missed % _RELOCATE_EVERY == 0:
+            if self._broken and self._searching and self._missed % _RELOCATE_EVERY == 1:
                 relocated = self._relocated()
                 if relocated is not None:
                     box, origin, self._broken = relocated, relocated.centre, False
+                    self._motion_filter.find_scene()
         self.box = box.at(origin + self._motion_filter.predict(dt, self.length))
-        if self._expected is not None:
-            (expected, found), self._expected = self._expected, None
-            if found and self._searching:
-                self._redetection.propose(expected, self._prediction())
-            elif not found:
-                self.box = box.at(expected.centre)
+        self._sure = sure.at(sure.centre + velocity.predict(dt, self.length)), velocity
+        if expected is not None:
+            self._use(expected)
         return origin
+
+    def _use(self, expected: Estimate) -> None:
+        """Take up where another tracker has the target."""
+        self._expected = None
+        box, found = self.box.at(np.array([expected.x, expected.y])), expected.state is TrackState.VISIBLE
+        self._support = box.centre if found else None
+        if self._missed and found:
+            turn = expected.heading - self._heading
+            box = box.turned(turn if np.isfinite(turn) else 0.0)
+            if self._searching:
+                self._redetection.propose(box, self._prediction())
+            else:
+                self.box = box
+        elif self._missed or not self.motion.trusted:
+            # One that jumps over the scene has lost it, if most of the scene moves alike.
+            clear = self.motion.trusted and self.motion.share > _MOST_OF_SCENE
+            self.follows = not clear or bool(np.hypot(*(box.centre - self.box.centre)) < self.length)
+            if self.follows:
+                self.box, self._other_std = box, expected.std
+            if not self.motion.trusted:
+                self._sure = self.box, copy(self._motion_filter)
 
     def _relocated(self) -> OrientedBox | None:
         """The target's prediction from where it was last seen, in the scene that is now recognised."""
@@ -198,12 +231,16 @@ class AppearanceTracker:
         box, answer = self._respond(image, self.box)
         score, peak = self._memory.score(image, box), answer.peak
         ratio = self._ratio = self._memory.tracking_ratio(score) + answer.log_ratio
+        if self._support is not None and np.hypot(*(box.centre - self._support)) < _SUPPORT_WITHIN * self.length:
+            ratio += _SUPPORT
+        # It can only be there if it is in the filter's window at all.
+        self._belief.doubt(math.erf(_WINDOW * self.length / self._motion_filter.std / math.sqrt(2.0)) ** 2)
         self._belief.add(ratio, dt)
         self.debug = {"peak": peak, "ratio": answer.ratio, "score": score, "llr": ratio, "b": self._belief.log_odds}
         if self._belief.visible:
             self._accept(image, box, score, peak, dt)
         else:
-            self._searching = self._belief.gone
+            self._searching = self._belief.gone or self._motion_filter.std > self.length
             self._miss(dt)
         if self._frame % _OBSERVE_EVERY == 0:
             self._observe_background(image, box)
@@ -217,9 +254,9 @@ class AppearanceTracker:
         # Where it looks less like the target than what is beside it, it says little about how the target moves.
         unsure = 1.0 - inside if self._ratio > 0.0 else 1.0
         self._motion_filter.correct(box.centre - self.box.centre, self.length, unsure)
+        wider, higher, turn = self._flow.change(image, box.centre) if inside > _SIZE_INSIDE else (1.0, 1.0, 0.0)
+        box = box.sized(box.sides * [wider, higher]).turned(turn)
         if inside > _LEARN_INSIDE:
-            wider, higher, turn = self._flow.change(image, box.centre)
-            box = box.sized(box.sides * [wider, higher]).turned(turn)
             self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)
             if self._frame % 3 == 0:
                 box = self._anchored(image, box)
@@ -235,6 +272,8 @@ class AppearanceTracker:
                 self._scene.keep()
                 self._since_keyframe = np.eye(3)
             self._last_sight = box, self._motion_filter.velocity
+            if self.certain and self._belief.log_odds > _CERTAIN:
+                self._sure = box, copy(self._motion_filter)
         self.box = box
         self._flow.remember(image, box)
 
@@ -296,6 +335,10 @@ class AppearanceTracker:
     def _miss(self, dt: float) -> None:
         if self._missed == 0:
             self._redetection = Redetection(self._size, self._memory, self._respond)
+            # What it was lost to has moved it since the evidence was last clear.
+            box, velocity = self._sure
+            if velocity.std < _SURE_STD * self.length:
+                self.box, self._motion_filter = box, copy(velocity)
         self._missed += 1
         self._unseen_s += dt
 
@@ -314,7 +357,9 @@ class AppearanceTracker:
 
     def _prediction(self) -> Prediction:
         motion = Kinematics(self._motion_filter.velocity, self._motion_filter.velocity_std, self.length)
-        return Prediction(self.box, self.std, motion, self._missed, self._unseen_s)
+        # That of the other tracker, where its place was followed: their geometric mean, for it knows the plane only.
+        std = float(np.sqrt(self.std * min(self._other_std, self.std)))
+        return Prediction(self.box, std, motion, self._missed, self._unseen_s)
 
     def _outline(self) -> Floats:
         """x0, y0, x1, y1 about the target [px]."""

@@ -21,6 +21,11 @@ class Belief:
     def __init__(self, log_odds: float = _LIMIT) -> None:
         self.log_odds = self.now = float(np.clip(log_odds, -_LIMIT, _LIMIT))
 
+    def doubt(self, within: float) -> None:
+        """The target lies in the region that is looked at with probability ``within`` only."""
+        on = min(max(within, 1e-3) / (1.0 + np.exp(-self.log_odds)), 1.0 - 1e-9)
+        self.log_odds = float(np.log(on) - np.log1p(-on))
+
     def add(self, log_ratio: float, dt: float) -> None:
         """One frame's log likelihood ratio, ``dt`` [s] after the last one."""
         on = 1.0 / (1.0 + np.exp(-self.log_odds))

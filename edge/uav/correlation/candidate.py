@@ -15,7 +15,7 @@ _TENTATIVE = -3.0  # log odds below which a place is not tested further
 _MAX_TESTS = 8  # frames for which a place is tested
 _HITS = 3  # consecutive frames of a re-detection
 _PLACE_STD = 0.05  # of a place measured twice, in target lengths
-_KEEPS, _TURNS, _STOPS = 0.75, 0.15, 0.1  # probabilities of what a target has done while away
+KEEPS, _TURNS, _STOPS = 0.75, 0.15, 0.1  # probabilities of what a target has done while away
 _STOOD = 0.3  # speed below which it stood and may go on to, in lengths a second
 _STILL, _STILL_STD = 0.5, 0.1  # share of the look-alikes that stand, and std of their speed, in lengths a second
 _SLOWEST = 0.35  # std of the velocity of what moves, at least, one coordinate, in lengths a second
@@ -38,8 +38,8 @@ class Kinematics:
         keeps = _normal(velocity - self.velocity, np.hypot(self.std, std))
         moves = _normal(velocity, np.hypot(wide, std))
         stands = _normal(velocity, np.hypot(_STILL_STD * self.length, std))
-        stood = 0.5 * _KEEPS * np.exp(-0.5 * np.square(self.velocity).sum() / (_STOOD * self.length) ** 2)
-        target = (_KEEPS - stood) * keeps + _TURNS * moves + (_STOPS + stood) * stands
+        stood = 0.5 * KEEPS * np.exp(-0.5 * np.square(self.velocity).sum() / (_STOOD * self.length) ** 2)
+        target = (KEEPS - stood) * keeps + _TURNS * moves + (_STOPS + stood) * stands
         return float(np.log(target + 1e-300) - np.log(_STILL * stands + (1.0 - _STILL) * moves + 1e-300))
 
 
@@ -69,8 +69,7 @@ class Candidate:
         self.moved = linear @ self.moved
         self.origin = motion.at(self.box.centre, reach)
         speed = self.moved / self.time if self.time else self.expected.velocity * 0.0
-        moved = self.box.at(self.origin + speed * dt).sized(self.box.sides * motion.zoom)
-        self.box = moved.turned(float(np.arctan2(linear[1, 0], linear[0, 0])))
+        self.box = motion.moved(self.box.at(self.origin + speed * dt))
 
     def add(self, box: OrientedBox, evidence: float, dt: float) -> None:
         """Add one frame: where it was found, and its log likelihood ratio.
@@ -101,9 +100,9 @@ class Candidate:
         return self.prior + self.evidence + motion
 
     @property
-    def hopeless(self) -> bool:
-        """Whether further frames will hardly make it the target."""
-        return self.log_odds < _TENTATIVE or self.hits > _MAX_TESTS
+    def promising(self) -> bool:
+        """Whether further frames may make it the target."""
+        return self.evidence > 0.0 and self.log_odds >= _TENTATIVE and self.hits <= _MAX_TESTS
 
     @property
     def accepted(self) -> bool:

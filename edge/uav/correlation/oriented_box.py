@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.special import ndtr
 
 from edge.uav.base import Box, Image
 from protocols.geometry.types import Floats
 
 _MAX_SHRINK = 2.0  # by linear interpolation alone; beyond, pixels are averaged first, against aliasing
-_MAX_SOURCE_PX = 4e7
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +70,10 @@ class OrientedBox:
         high = np.minimum(self.centre + half, np.array(size) - 0.5)
         return float(np.prod(np.clip(high - low, 0.0, None)) / np.prod(2.0 * half))
 
-    def share_within(self, reach: Floats, size: tuple[int, int]) -> float:
-        """Share of the rectangle within ``reach`` (2,) of the centre that lies in an image of this size."""
-        low = np.maximum(self.centre - reach, 0.0)
-        high = np.minimum(self.centre + reach, np.array(size) - 1.0)
-        return float(np.prod(np.clip(high - low, 0.0, None)) / np.prod(2.0 * reach))
+    def probability_inside(self, std: float, size: tuple[int, int]) -> float:
+        """Probability that the centre lies in an image of this size; std: of it, one coordinate [px]."""
+        low, high = -self.centre / std, (np.array(size) - 1.0 - self.centre) / std
+        return float(np.prod(ndtr(high) - ndtr(low)))
 
 
 def crop(image: Image, box: OrientedBox, size: tuple[int, int]) -> Image:
@@ -95,8 +94,7 @@ def crop(image: Image, box: OrientedBox, size: tuple[int, int]) -> Image:
 def _averaged(image: Image, box: OrientedBox, shrink: int) -> tuple[Image, Floats]:
     """The part of the image about a box, reduced by an integer, and its first pixel (2,)."""
     rows, columns = image.shape[:2]
-    c, s = abs(np.cos(box.angle)), abs(np.sin(box.angle))
-    half = 0.5 * np.array([c * box.width + s * box.height, s * box.width + c * box.height]) + 2 * shrink
+    half = 0.5 * box.extent + 2 * shrink
     limit = np.array([columns, rows]) - shrink
     low = np.clip(np.floor(box.centre - half), 0, np.maximum(limit, 0)).astype(int)
     high = np.clip(np.ceil(box.centre + half), low + shrink, [columns, rows]).astype(int)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.uav.base import Image
-from edge.uav.correlation.candidate import Candidate, Kinematics
+from edge.uav.correlation.candidate import KEEPS, Candidate, Kinematics
 from edge.uav.correlation.filter import Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -17,18 +17,21 @@ from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats
 
 _MARGIN = 1.0  # log odds by which a place must exceed the next best one, and the one under test
+_MANOEUVRE = 3.0  # acceleration of what brakes, turns or sets off, in lengths a second squared; a car that starts
 _ANYWHERE_RATE = 0.01  # at which a target is not near its prediction any more [1/s]
-_PROPOSED = -2.0  # log prior of a place that another tracker has found
+_PROPOSED = 1.0  # log prior of a place that another tracker has found
 _PROMISING = 0.0  # log odds of a place under test above which others are searched about the prediction only
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
 _MOST_TESTED, _RIVAL_MARGIN = 2, 2.0  # places that are tested at once; log odds within which one is a rival
 _DETECTION = 0.25  # probability that one search finds a target in view
+_HIDDEN = 0.1  # probability that it is in view, but behind something, for as long as it is away
 _CHANGE = 0.1  # std of the similarity of a target that has been away
 _MIN_INSIDE = 0.6  # share of a place in the image
 _TRIAL_SIZES = (0.9, 1.1)
 _FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
 _SIZES = (1.0, 0.87, 1.15, 0.75, 1.33)
-_ANGLES = (0.0, 0.0, 0.35, 0.0, -0.35, 0.0, 0.7, 0.0, -0.7, 0.0, 1.1, 0.0, -1.1, 0.0, 1.57)
+_UPRIGHT = float("nan")  # as in the first image, however it had turned: most targets only seem to turn
+_ANGLES = (0.0, _UPRIGHT, 0.35, 0.0, -0.35, _UPRIGHT, 0.7, 0.0, -0.7, _UPRIGHT, 1.1, 0.0, -1.1, _UPRIGHT, 1.57)
 
 Localise = Callable[[Image, OrientedBox], tuple[OrientedBox, Response]]
 
@@ -43,6 +46,11 @@ class Prediction:
     frames: int
     seconds: float
 
+    @property
+    def wide(self) -> float:
+        """Std of its centre if it turns, brakes or sets off, one coordinate [px]."""
+        return float(np.hypot(self.std, 0.5 * _MANOEUVRE * self.motion.length * self.seconds**2))
+
 
 class Redetection:
     """One absence. size: of the images [px]; localise: the box and the answer of the target's filter about a box."""
@@ -50,11 +58,8 @@ class Redetection:
     def __init__(self, size: tuple[int, int], memory: TemplateMemory, localise: Localise) -> None:
         self._size, self._memory, self._localise = size, memory, localise
         self._near = 1.0
+        self._inside, self._unnoticed = 0.0, 1.0  # probability that it is in the image, and that it was not seen there
         self._tested: list[Candidate] = []
-        self._proposals, self._proposal_at = (
-            0,
-            0,
-        )  # how many; frame of the absence from which another tracker's place is tested
         self.debug: dict[str, float] = {}
 
     def move(self, motion: Motion, reach: float, dt: float) -> None:
@@ -64,12 +69,12 @@ class Redetection:
 
     def propose(self, box: OrientedBox, expected: Prediction) -> None:
         """Test a place that another tracker has found."""
-        if expected.frames >= self._proposal_at and not any(c.covers(box) for c in self._tested):
-            prior = float(np.logaddexp(self._log_prior(box.centre, expected), _PROPOSED))
+        prior = float(np.logaddexp(self._log_prior(box.centre, expected), _PROPOSED))
+        same = [c for c in self._tested if c.covers(box)]
+        for candidate in same:
+            candidate.prior = max(candidate.prior, prior)
+        if not same:
             self._tested.append(Candidate(box, prior, expected.motion))
-            # A wrong one must not leave no time for the search.
-            self._proposals += 1
-            self._proposal_at = expected.frames + 2 ** min(self._proposals, 4)
 
     def look(self, image: Image, expected: Prediction, dt: float) -> Candidate | None:
         """Search one image; the place that is taken for the target, if any: by its odds, and a margin over the next."""
@@ -89,13 +94,13 @@ class Redetection:
     def _search(self, image: Image, expected: Prediction, dt: float) -> None:
         """Take up the likeliest new place: in turn about the prediction, and in one tile after the other."""
         box, turn = expected.box, expected.frames // 2
-        box = box.sized(box.sides * _SIZES[turn % len(_SIZES)]).turned(_ANGLES[turn % len(_ANGLES)])
-        reach = 3.0 * expected.std + 0.3 * box.sides
+        angle = _ANGLES[turn % len(_ANGLES)]
+        box = box.sized(box.sides * _SIZES[turn % len(_SIZES)]).turned(-box.angle if np.isnan(angle) else angle)
+        reach = max(3.0 * expected.std, 2.0 * expected.wide) + 0.3 * box.sides
         if expected.frames % 2:
             box, reach = tile(box, self._size, turn)
         else:
-            # Where it was expected and is not seen, it is less and less likely to be.
-            self._near *= 1.0 - _DETECTION * box.share_within(reach, self._size)
+            self._find_nothing(expected)
         new = [f for f in search(image, self._memory, box, reach) if not any(c.covers(f.box) for c in self._tested)]
         if not new:
             return
@@ -109,14 +114,25 @@ class Redetection:
                 if self._test(image, candidate, expected, dt):
                     self._tested.append(candidate)
 
+    def _find_nothing(self, expected: Prediction) -> None:
+        """Where it was expected and is not seen, it is less and less likely to be; beyond the border it can be."""
+        before, self._inside = self._inside, expected.box.probability_inside(expected.std, self._size)
+        entered = max(self._inside - before, 0.0)
+        unnoticed = (min(self._inside, before) * self._unnoticed + entered) / max(self._inside, 1e-6)
+        self._unnoticed = max((1.0 - _DETECTION) * unnoticed, _HIDDEN)
+        self._near = 1.0 - self._inside * (1.0 - self._unnoticed)
+
     def _log_prior(self, place: Floats, expected: Prediction) -> float:
         """Log probability that the target is in the box about ``place`` (2,): near the prediction, or anywhere."""
         area = expected.box.width * expected.box.height
-        variance = expected.std**2
-        squared = float(np.square(place - expected.box.centre).sum()) / variance
         share = self._near / (self._near + 1.0 - np.exp(-_ANYWHERE_RATE * expected.seconds))
-        # Student's t with two degrees of freedom: what turns or brakes leaves the Gaussian.
-        near = np.log(share + 1e-12) - 2.0 * np.log1p(0.5 * squared) + np.log(min(area / (2.0 * np.pi * variance), 1.0))
+        squared = float(np.square(place - expected.box.centre).sum())
+        near = np.log(share + 1e-12) + float(
+            np.logaddexp(
+                np.log(KEEPS) + _log_density(squared, expected.std, area),
+                np.log(1.0 - KEEPS) + _log_density(squared, expected.wide, area),
+            )
+        )
         return float(np.logaddexp(near, np.log((1.0 - share) * area / (self._size[0] * self._size[1]))))
 
     def _test(self, image: Image, candidate: Candidate, expected: Prediction, dt: float) -> bool:
@@ -133,4 +149,12 @@ class Redetection:
         evidence = self._memory.log_ratio(score, _CHANGE, answer.log_ratio)
         candidate.add(box, evidence, dt)
         self.debug |= {"score": score, "llr": evidence, "ratio": answer.ratio, "prior": candidate.prior}
-        return evidence > 0.0 and box.share_inside(self._size) > _MIN_INSIDE and not candidate.hopeless
+        return candidate.promising and box.share_inside(self._size) > _MIN_INSIDE
+
+
+def _log_density(squared: float, std: float, area: float) -> float:
+    """Log probability of a place in the box: Student's t with two degrees of freedom, for the std itself is a guess.
+
+    squared: squared distance from the prediction [px^2]; std: of the prediction, one coordinate [px]; area: of the box.
+    """
+    return float(-2.0 * np.log1p(0.5 * squared / std**2) + np.log(min(area / (2.0 * np.pi * std**2), 1.0)))

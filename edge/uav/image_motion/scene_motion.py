@@ -2,7 +2,7 @@
 
 A camera that turns and zooms moves the whole image by one map; one that travels moves near ground more than distant
 background. The map is therefore a similarity fitted to the largest consistent set of tracks, plus a correction at
-the place of interest: the weighted median of what the tracks near it move beyond the similarity. A similarity, unlike
+the place of interest: a robust linear fit to what the tracks near it move beyond the similarity. A similarity, unlike
 a homography, stays bounded outside the image, where the target is while it is away.
 """
 
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.uav.base import Image
+from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.image_motion.keyframe import Keyframe
 from protocols.geometry.types import Bools, Floats
 
@@ -25,9 +26,11 @@ _MAX_TRACKS = 120
 _LK_WINDOW, _LK_LEVELS = 13, 3
 _BACKWARD_PX = 0.7  # forward-backward distance of a good track [px of the working image]
 _RANSAC_PX = 1.5  # residual of a track of the static scene [px of the working image]
+_BENT = 0.04  # of the shift by a turn: mean of (x/f)^2 over half an image as wide as its focal length
 _MIN_TRACKS, _MIN_SHARE = 12, 0.35  # of a trusted motion: static tracks, and their share
 _PARTS, _VOTE_PX = (4, 2), 2  # parts that are searched after a fast pan; agreement of their shifts [px, reduced]
 _PARALLAX_PX = 6.0  # largest correction [px of the working image]
+_PARALLAX_PRIOR = (1.0, 2.0, 2.0)  # tracks that say there is none, and that it does not grow
 _REACH = 0.3  # of the parallax correction, over the image's width
 
 
@@ -50,15 +53,24 @@ class Motion:
         """Change of scale."""
         return float(np.hypot(self.matrix[0, 0], self.matrix[1, 0]))
 
+    def moved(self, box: OrientedBox) -> OrientedBox:
+        """A box turned and sized with the scene, about the same centre."""
+        return box.sized(box.sides * self.zoom).turned(float(np.arctan2(self.matrix[1, 0], self.matrix[0, 0])))
+
     def at(self, point: Floats, reach: float) -> Floats:
         """Where the static scene at ``point`` (2,) [px] has moved, with the parallax of the tracks within ``reach``."""
         moved = self.matrix[:, :2] @ point + self.matrix[:, 2]
         if not self.trusted or len(self.points) < _MIN_TRACKS:
             return np.asarray(moved)
-        weight = np.exp(-0.5 * np.square(self.points - point).sum(axis=1) / reach**2)
-        total = float(weight.sum())
-        correction = np.array([_weighted_median(self.residuals[:, k], weight) for k in range(2)])
-        return np.asarray(moved + correction * total / (total + 2.0))
+        near = (self.points - point) / reach
+        weight = kept = np.exp(-0.5 * np.square(near).sum(axis=1))
+        model = np.column_stack([np.ones(len(near)), near])  # on a plane seen obliquely, parallax grows linearly
+        for _ in range(3):
+            normal = model.T @ (weight[:, None] * model) + np.diag(_PARALLAX_PRIOR)
+            correction = np.linalg.solve(normal, model.T @ (weight[:, None] * self.residuals))
+            misfit = np.square(self.residuals - model @ correction).sum(axis=1)
+            weight = kept / (1.0 + misfit / (4.0 * max(float(np.median(misfit)), 0.04)))
+        return np.asarray(moved + correction[0])
 
 
 STILL = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), False, 0.0)
@@ -119,15 +131,18 @@ class SceneMotion:
     def _fit(self, old: Floats, new: Floats) -> Motion:
         if len(old) < _MIN_TRACKS:
             return STILL
+        # A turn of the camera moves the image by a homography: what it bends is a share of the shift.
+        tolerance = 1.0 + _BENT * float(np.median(np.hypot(*(new - old).T))) / _RANSAC_PX
+        limit = tolerance * _RANSAC_PX
         matrix, inlier = cv2.estimateAffinePartial2D(
-            old, new, method=cv2.RANSAC, ransacReprojThreshold=_RANSAC_PX, maxIters=300, confidence=0.995
+            old, new, method=cv2.RANSAC, ransacReprojThreshold=limit, maxIters=300, confidence=0.995
         )
         if matrix is None:
             return STILL
         mask: Bools = inlier.ravel() > 0
         share = float(mask.mean())
         residual = new - (old @ matrix[:, :2].T + matrix[:, 2])
-        near = np.square(residual).sum(axis=1) < _PARALLAX_PX**2
+        near = np.square(residual).sum(axis=1) < (tolerance * _PARALLAX_PX) ** 2
         zoom = float(np.hypot(matrix[0, 0], matrix[1, 0]))
         trusted = bool(int(mask.sum()) >= _MIN_TRACKS and share > _MIN_SHARE and 0.5 < zoom < 2.0)
         full = self._to_full(np.asarray(matrix, np.float64))
@@ -173,9 +188,3 @@ class SceneMotion:
         chosen = agree[int(votes.argmax())]
         dx, dy = 4.0 * shift[chosen].mean(axis=0)
         return np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]])
-
-
-def _weighted_median(values: Floats, weights: Floats) -> float:
-    order = np.argsort(values)
-    cumulative = np.cumsum(weights[order])
-    return float(values[order[int(np.searchsorted(cumulative, 0.5 * cumulative[-1]))]])

@@ -48,11 +48,7 @@ class GroundTexture:
 
 
 def paint_ground(
-    rng: np.random.Generator,
-    area: Area,
-    roads: Sequence[Road],
-    yards: Sequence[Floats],
-    shadows: Sequence[Floats],
+    rng: np.random.Generator, area: Area, roads: Sequence[Road], yards: Sequence[Floats], shadows: Sequence[Floats]
 ) -> GroundTexture:
     """Paint the ground texture. yards, shadows: outlines (k, 2) [m]."""
     canvas = _Canvas(area)

@@ -56,13 +56,7 @@ class FlightRenderer:
             self._clouds = np.asarray(255.0 * (1.0 - illumination.clouds * shade), np.float32)
 
     def render(
-        self,
-        frame: int,
-        matrix: Floats,
-        camera: Floats,
-        moving: Sequence[cars.Car],
-        *,
-        noise: bool = True,
+        self, frame: int, matrix: Floats, camera: Floats, moving: Sequence[cars.Car], *, noise: bool = True
     ) -> Image:
         """The image of one frame. matrix: (3, 4) pixels from NED; camera: its centre (3,) NED [m].
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.uav.base import Basis, Box, Estimate, Image, TrackState
+from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, TrackState
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.filter import CorrelationFilter, windowed
 from edge.uav.correlation.oriented_box import OrientedBox, crop
@@ -15,6 +15,7 @@ from edge.uav.image_motion.keyframe import Keyframe
 from edge.uav.image_motion.scene_motion import STILL, SceneMotion
 from edge.uav.tracker_factory import make_tracker
 from edge.uav.world.oblique.world import ObliqueWorld
+from protocols.geometry.camera import Intrinsics
 
 SIZE = (320, 240)
 TARGET = (34, 22)
@@ -199,6 +200,30 @@ def test_an_oblique_flight_without_lens_and_telemetry_is_followed(target: str) -
         assert e.basis is not None
         assert e.reason
     assert e.basis in (Basis.STABILISED, Basis.PLANE)
+
+
+def test_lens_and_telemetry_do_not_make_an_oblique_flight_worse() -> None:
+    """The same flight twice, without and with intrinsics, attitude and position of the camera."""
+    world = ObliqueWorld("car", "follow", seed=5, frames=60, fps=15.0)
+    frames = [world.rendered(i) for i in range(60)]
+    body_from_camera = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    ned_from_world = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    focal = frames[0][1].focal
+    matrix = np.array([[focal, 0.0, (world.size[0] - 1) / 2], [0.0, focal, (world.size[1] - 1) / 2], [0.0, 0.0, 1.0]])
+    lens = Intrinsics(*world.size, matrix)
+    near = []
+    for known in (False, True):
+        tracker = make_tracker("ground", world.size, *((lens, body_from_camera) if known else ()), fps=world.fps)
+        near.append(0)
+        for i, (image, truth) in enumerate(frames):
+            if known:
+                attitude = ned_from_world @ truth.rotation.T @ body_from_camera.T
+                tracker.handle_telemetry(Telemetry(i / world.fps, attitude, ned_from_world @ truth.centre))
+            e = tracker.begin(image, 0.0, truth.box) if i == 0 else tracker.handle_frame(image, i / world.fps)
+            centre = truth.box.x + 0.5 * truth.box.width, truth.box.y + 0.5 * truth.box.height
+            near[-1] += bool(np.hypot(e.x - centre[0], e.y - centre[1]) < max(0.3 * truth.box.width, 8.0))
+    assert near[0] >= 57
+    assert near[1] >= near[0]
 
 
 def test_a_black_image_leaves_the_plain_image_as_the_basis(scene: Image) -> None:

@@ -1,0 +1,153 @@
+"""Targets that are lost and found again by their appearance: where they are looked for, and what is believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.uav.adaptive_tracker import AdaptiveTracker
+from edge.uav.base import Basis, Box, Estimate, Image, TrackState
+from edge.uav.correlation.appearance_tracker import AppearanceTracker
+from edge.uav.correlation.belief import Belief
+from edge.uav.correlation.candidate import Kinematics
+from edge.uav.correlation.filter import Response
+from edge.uav.correlation.memory import TemplateMemory
+from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.correlation.redetection import Prediction, Redetection
+from edge.uav.correlation.velocity import VelocityFilter
+from edge.uav.image_motion.scene_motion import SceneMotion
+
+SIZE = (320, 240)
+FPS = 15.0
+TARGET = np.array([30, 20])
+
+
+@pytest.fixture(scope="module")
+def scene() -> Image:
+    """A textured scene (480, 900, 3)."""
+    rng = np.random.default_rng(5)
+    coarse = rng.uniform(60, 190, (24, 45, 3)).astype(np.float32)
+    fine = cv2.GaussianBlur(rng.normal(0, 60, (480, 900, 3)).astype(np.float32), (0, 0), 1.5)
+    return np.asarray(np.clip(cv2.resize(coarse, (900, 480), interpolation=cv2.INTER_CUBIC) + fine, 0, 255), np.uint8)
+
+
+def painted(scene: Image, place: np.ndarray, opacity: float = 1.0) -> Image:
+    """A window of the scene with a red and white target about ``place``."""
+    image = np.ascontiguousarray(scene[100 : 100 + SIZE[1], 200 : 200 + SIZE[0]])
+    shown = image.copy()
+    low, high = np.rint(place - 0.5 * TARGET).astype(int), np.rint(place + 0.5 * TARGET).astype(int) - 1
+    cv2.rectangle(shown, low.tolist(), high.tolist(), (30, 40, 220), -1)
+    cv2.rectangle(shown, (low + 5).tolist(), (high - 9).tolist(), (240, 240, 240), -1)
+    return np.asarray(cv2.addWeighted(shown, opacity, image, 1.0 - opacity, 0.0), np.uint8)
+
+
+def test_what_the_target_was_lost_to_does_not_move_it(scene: Image) -> None:
+    """Behind something that stands and looks a little like it, it must be predicted to go on at its own speed."""
+    tracker = AppearanceTracker(SIZE, FPS)
+    start, step = np.array([60.0, 120.0]), np.array([3.0, 0.0])
+    box = Box(*(start - 0.5 * TARGET), *map(float, TARGET))
+    tracker.begin(painted(scene, start), 0.0, box)
+    for k in range(1, 18):
+        tracker.handle_frame(painted(scene, start + k * step), k / FPS)
+    for k in range(18, 34):
+        found = tracker.handle_frame(painted(scene, start + 17 * step, 0.25 if k < 24 else 0.0), k / FPS)
+    assert found.state is TrackState.COASTING
+    assert abs(found.x - (start + 33 * step)[0]) < 12.0
+
+
+def test_a_fast_turn_of_the_camera_is_measured(scene: Image) -> None:
+    """A turn bends the image: few tracks agree with one similarity to a pixel, though it says where the scene went."""
+    focal, angle = 260.0, np.deg2rad(14.0)
+    camera = np.array([[focal, 0.0, 450.0], [0.0, focal, 240.0], [0.0, 0.0, 1.0]])
+    c, s = np.cos(angle), np.sin(angle)
+    turn = camera @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) @ np.linalg.inv(camera)
+    later = np.asarray(cv2.warpPerspective(scene, turn, (900, 480)), np.uint8)
+    motion = SceneMotion(SIZE)
+    motion.update(np.ascontiguousarray(scene[120:360, 290:610]), None)
+    found = motion.update(np.ascontiguousarray(later[120:360, 290:610]), None)
+    assert found.trusted
+    middle = np.array([159.5, 119.5])
+    assert found.matrix @ [*middle, 1.0] - middle == pytest.approx([focal * np.tan(angle), 0.0], abs=10.0)
+
+
+def prediction(x: float, seconds: float = 1.0, std: float = 10.0) -> Prediction:
+    return Prediction(OrientedBox(x, 120.0, 30.0, 20.0), std, Kinematics(np.zeros(2), 5.0, 30.0), 10, seconds)
+
+
+def redetection() -> Redetection:
+    def localise(image: Image, box: OrientedBox) -> tuple[OrientedBox, Response]:
+        return box, Response(0.0, 0.0, 0.0, 1.0)
+
+    return Redetection(SIZE, TemplateMemory(), localise)
+
+
+def test_a_target_beyond_the_border_is_not_ruled_out_by_what_the_image_shows() -> None:
+    """A look-alike far off was taken for a car that was just about to come back into the picture."""
+    outside, inside = redetection(), redetection()
+    for _ in range(20):
+        outside._find_nothing(prediction(-40.0))
+        inside._find_nothing(prediction(160.0))
+    assert outside._near > 0.95
+    assert inside._near < 0.2
+    outside._find_nothing(prediction(30.0))  # it comes in, and was not looked for there before
+    assert outside._near > 0.6
+
+
+def test_a_target_that_sets_off_while_away_is_likelier_near_than_anywhere() -> None:
+    """Cars that wait at a light were searched for where they had stood only."""
+    search = redetection()
+    near, far = (search._log_prior(np.array([160.0 + d, 120.0]), prediction(160.0, 0.8, 4.0)) for d in (45.0, 150.0))
+    assert near > far + 2.0
+
+
+def test_what_moves_is_predicted_less_surely_than_what_stands() -> None:
+    stds = []
+    for speed in (0.0, 60.0):
+        kept = VelocityFilter(20.0)
+        kept.restart(np.array([speed, 0.0]), 0.5, 20.0)
+        for _ in range(30):
+            kept.predict(1.0 / FPS, 20.0)
+        stds.append(kept.std)
+    assert stds[1] > 1.8 * stds[0]
+
+
+def test_a_scene_that_is_recognised_again_ends_the_doubt_about_where_it_is() -> None:
+    kept = VelocityFilter(20.0)
+    before = kept.std
+    kept.lose_scene(64.0)
+    assert kept.std > 60.0
+    kept.find_scene()
+    assert kept.std == before
+
+
+def test_a_place_out_of_the_filters_window_is_not_believed() -> None:
+    """In a pan that could not be measured a box that stayed where it was had been reported visible."""
+    near, far = Belief(), Belief()
+    near.doubt(1.0)
+    far.doubt(0.3)
+    for belief in (near, far):
+        belief.add(-1.6, 0.1)
+    assert near.visible
+    assert not far.visible
+
+
+def test_where_the_ground_has_lost_the_target_the_appearance_answers(
+    scene: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lost ground's prediction had been the answer for as long as the appearance was not certain."""
+    monkeypatch.setattr(AppearanceTracker, "certain", property(lambda tracker: False))
+    tracker = AdaptiveTracker(SIZE, fps=FPS)
+    place = np.array([120.0, 120.0])
+    tracker.begin(painted(scene, place), 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
+    tracker._trust = 1.0
+    ground = tracker._ground
+    assert ground is not None
+    lost = Estimate(1 / FPS, TrackState.COASTING, 160.0, 120.0, 30.0, 20.0, float("nan"), 5.0)
+    ground.handle_frame = lambda image, time: replace(lost, time=time)  # type: ignore[method-assign]
+    found = tracker.handle_frame(painted(scene, place), 1 / FPS)
+    assert found.state is TrackState.VISIBLE
+    assert found.basis in (Basis.STABILISED, Basis.IMAGE)
+    assert abs(found.x - place[0]) < 3.0
