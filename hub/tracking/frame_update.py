@@ -70,7 +70,7 @@ def process_frame(
     state: MultiTargetState, frame: FrameDetections, cameras: dict[str, TrackingCamera], parameters: TrackerParameters
 ) -> MultiTargetState:
     """The state after one frame; frames must be processed in the order of their keys."""
-    name = frame.camera.name
+    name, frame = frame.camera.name, frame.slanted(parameters.up)
     state = state.with_camera(name)
     if state.scan is None or any(one.frame.camera.name == name for one in state.scan.frames):
         state = jointly(state, parameters)
