@@ -178,9 +178,10 @@ class BatchSmoother:
             predicted = on_floor(predicted, self.floor, abs(elapsed))
             alive[rows] = False
             entering = np.flatnonzero(alive)
-            births = prior_of_births(self.tracks.select(entering), self.floor, self.parameters)
             rows = np.concatenate([rows[keep], entering])
-            predicted = predicted.concatenate(births)
+            if len(entering):
+                births = prior_of_births(self.tracks.select(entering), self.floor, self.parameters)
+                predicted = predicted.concatenate(births)
             said = self.evidence[index].total.of(_places(self.evidence[index].row, rows))
             manoeuvre = manoeuvre_hypothesis(predicted, elapsed, units, up)
             widened = widened_by_evidence(predicted, manoeuvre, said.information, said.vector)
@@ -387,23 +388,15 @@ class BatchSmoother:
         """Log odds (h, t) of tail t, at the scan after ``index``, continuing head h, last seen in scan ends[h]."""
         scan = self.scans[index + 1]
         past = self.tracks.select(heads)
-        mean, covariance, gap, ahead = (
-            past.mean.copy(),
-            past.covariance.copy(),
-            np.zeros(len(heads)),
-            np.zeros(len(heads)),
-        )
-        seen = past.mean[:, POSITION].copy()
+        mean, covariance = past.mean.copy(), past.covariance.copy()
         for at in np.unique(ends).tolist():
-            chosen = ends == at
-            rows = _places(forward[at].row, heads[chosen])
-            state = replace(past.select(chosen), mean=forward[at].mean[rows], covariance=forward[at].covariance[rows])
-            seen[chosen] = state.mean[:, POSITION]
-            elapsed = (scan.now_ns - self.scans[at].now_ns) / NANOSECONDS
-            state = on_floor(predict_targets(state, elapsed, self.parameters), self.floor, elapsed)
-            mean[chosen], covariance[chosen], ahead[chosen] = state.mean, state.covariance, elapsed
-            gap[chosen] = (self.scans[index].now_ns - self.scans[at].now_ns) / NANOSECONDS
-        past = replace(past, mean=mean, covariance=covariance)
+            rows = _places(forward[at].row, heads[chosen := ends == at])
+            mean[chosen], covariance[chosen] = forward[at].mean[rows], forward[at].covariance[rows]
+        ended = np.array([self.scans[at].now_ns for at in ends.tolist()], dtype=np.int64)
+        gap, ahead = (self.scans[index].now_ns - ended) / NANOSECONDS, (scan.now_ns - ended) / NANOSECONDS
+        seen = mean[:, POSITION]
+        past = predict_targets(replace(past, mean=mean, covariance=covariance), ahead, self.parameters)
+        past = on_floor(past, self.floor, ahead)
         rows = _places(after.row, tails)
         future = replace(self.tracks.select(tails), mean=after.mean[rows], covariance=after.covariance[rows])
         typical = float(np.median(self.tracks.mean[:, LOG_SIZE]))
