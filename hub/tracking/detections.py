@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -87,7 +87,8 @@ class FrameDetections:
 
     reference_ns: capture time on the reference clock. point, head, foot: (n, 2). noise: (n, 2, 2) covariance of the
     point; units_per_px: (n,) normalised units per pixel there. size: (n,). colour: (n, 3). kind: (n,) index in
-    TARGET_MODELS. target: label of the track that the camera's own tracker matched, "" = none.
+    TARGET_MODELS. target: label of the track that the camera's own tracker matched, "" = none. is_box: (n,) whether
+    head and foot are the middles of a box's top and bottom: in one column of the image.
     """
 
     camera: TrackingCamera
@@ -103,6 +104,7 @@ class FrameDetections:
     colour: Floats
     kind: Ints
     target: tuple[str, ...]
+    is_box: Bools
 
     @property
     def key(self) -> tuple[int, str, str, int]:
@@ -111,6 +113,23 @@ class FrameDetections:
 
     def __len__(self) -> int:
         return len(self.point)
+
+    def slanted(self, up: Floats | None) -> FrameDetections:
+        """The same with the points of each box on the image of the vertical through its centre.
+
+        A box has the image's axes, a body is seen along the vertical ``up`` (3,): beside the vertical line through the
+        principal point, and where a camera is rolled, head and foot are not above each other.
+        """
+        if up is None or not self.is_box.any():
+            return self
+        axis = self.camera.pose.rotation @ up
+        centre = 0.5 * (self.head + self.foot)
+        along = axis[:2] - axis[2] * centre
+        steep = np.flatnonzero(self.is_box & (np.abs(along[:, 0]) < np.abs(along[:, 1])))
+        points = np.stack([self.point, self.head, self.foot])
+        slope = along[steep, 0] / along[steep, 1]
+        points[:, steep, 0] = centre[steep, 0] + slope * (points[:, steep, 1] - centre[steep, 1])
+        return replace(self, point=points[0], head=points[1], foot=points[2])
 
 
 def frame_detections(
@@ -148,6 +167,7 @@ def frame_detections(
         colour=np.array(colour, dtype=np.float64).reshape(-1, 3),
         kind=np.array([KIND_INDEX[tracked_kind(d)] for d in found], dtype=np.int64),
         target=tuple(d.target for d in found),
+        is_box=np.array([bool(d.head and d.foot) and d.head[0] == d.foot[0] for d in found], dtype=np.bool_),
     )
 
 

@@ -70,7 +70,7 @@ def process_frame(
     state: MultiTargetState, frame: FrameDetections, cameras: dict[str, TrackingCamera], parameters: TrackerParameters
 ) -> MultiTargetState:
     """The state after one frame; frames must be processed in the order of their keys."""
-    name = frame.camera.name
+    name, frame = frame.camera.name, frame.slanted(parameters.up)
     state = state.with_camera(name)
     if state.scan is None or any(one.frame.camera.name == name for one in state.scan.frames):
         state = jointly(state, parameters)
@@ -102,9 +102,9 @@ def process_frame(
     return manage_tracks(initiate_tracks(state, frame, cameras, parameters), elapsed, parameters)
 
 
-def predict_targets(targets: Targets, elapsed: float, parameters: TrackerParameters) -> Targets:
-    """The targets predicted by ``elapsed`` seconds."""
-    if not len(targets) or elapsed == 0.0:
+def predict_targets(targets: Targets, elapsed: Floats | float, parameters: TrackerParameters) -> Targets:
+    """The targets predicted by ``elapsed`` seconds, each (n,) or all."""
+    if not len(targets) or not np.any(elapsed):
         return targets
     units_per_m = units_of(targets, parameters.scale.units_per_m)
     speed = np.linalg.norm(targets.mean[:, VELOCITY], axis=1) / units_per_m
@@ -116,27 +116,24 @@ def predict_targets(targets: Targets, elapsed: float, parameters: TrackerParamet
     mean, covariance = kalman.predict(
         targets.mean, targets.covariance, elapsed, acceleration_psd, _LOG_SIZE_PSD, velocity_psd
     )
-    existence = targets.existence * np.exp(-max(elapsed, 0.0) / _LIFETIME_S)
+    existence = targets.existence * np.exp(-np.maximum(elapsed, 0.0) / _LIFETIME_S)
     return replace(targets, mean=mean, covariance=covariance, existence=existence)
 
 
-def on_floor(targets: Targets, floor: Floor | None, elapsed: float) -> Targets:
-    """Upright targets with their feet on the floor, where it is known."""
-    standing = np.flatnonzero(_UPRIGHT[targets.kind])
-    if floor is None or not floor.known or not len(standing) or elapsed <= 0.0:
+def on_floor(targets: Targets, floor: Floor | None, elapsed: Floats | float) -> Targets:
+    """Upright targets with their feet on the floor, where it is known; ``elapsed`` (n,) or all, since the last time."""
+    elapsed = np.broadcast_to(elapsed, (len(targets),))
+    standing = np.flatnonzero(_UPRIGHT[targets.kind] & (elapsed > 0.0))
+    if floor is None or not floor.known or not len(standing):
         return targets
     mean, covariance = targets.mean.copy(), targets.covariance.copy()
     innovation, jacobian, variance = floor.constraint(mean[standing])
     # What is uneven under somebody's foot now is so a moment later: half a second is one observation.
-    noise = variance * max(CORRELATION_S / elapsed, 1.0)
-    mean[standing], covariance[standing] = kalman.update(
-        mean[standing],
-        covariance[standing],
-        innovation[:, None],
-        jacobian[:, None],
-        noise[:, None, None],
-        np.ones((len(standing), 1), dtype=np.bool_),
-    )
+    noise = variance * np.maximum(CORRELATION_S / elapsed[standing], 1.0)
+    cross = (covariance[standing] @ jacobian[:, :, None])[:, :, 0]
+    gain = cross / ((jacobian * cross).sum(axis=1) + noise)[:, None]
+    mean[standing] += gain * innovation[:, None]
+    covariance[standing] -= gain[:, :, None] * cross[:, None]
     return replace(targets, mean=mean, covariance=covariance)
 
 

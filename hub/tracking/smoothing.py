@@ -132,10 +132,10 @@ class BatchSmoother:
         out: list[SmoothedScan] = []
         for number in range(iterations + 1):
             if number:
-                self._cut(out)
+                cut = self._cut(out)
                 forward, backward = self._filter(1), self._filter(-1)
                 self._rates = self._entry_exit_rates(forward, backward)
-                self._link(forward, backward)
+                self._link(forward, backward, cut)
             if 0 < number <= _WIDTHS:
                 forward, backward = self._filter(1), self._filter(-1)
                 self._rates = self._entry_exit_rates(forward, backward)
@@ -178,9 +178,10 @@ class BatchSmoother:
             predicted = on_floor(predicted, self.floor, abs(elapsed))
             alive[rows] = False
             entering = np.flatnonzero(alive)
-            births = prior_of_births(self.tracks.select(entering), self.floor, self.parameters)
             rows = np.concatenate([rows[keep], entering])
-            predicted = predicted.concatenate(births)
+            if len(entering):
+                births = prior_of_births(self.tracks.select(entering), self.floor, self.parameters)
+                predicted = predicted.concatenate(births)
             said = self.evidence[index].total.of(_places(self.evidence[index].row, rows))
             manoeuvre = manoeuvre_hypothesis(predicted, elapsed, units, up)
             widened = widened_by_evidence(predicted, manoeuvre, said.information, said.vector)
@@ -251,16 +252,19 @@ class BatchSmoother:
         off = np.minimum(np.abs(times - changed[nearest]), np.abs(times - changed[np.maximum(nearest - 1, 0)]))
         return np.asarray(off <= _REACH_S * NANOSECONDS)
 
-    def _cut(self, smoothed: Sequence[SmoothedScan]) -> None:
-        """Cut tracks where cameras that should have seen them did not: whoever follows is somebody else."""
+    def _cut(self, smoothed: Sequence[SmoothedScan]) -> dict[int, int]:
+        """Cut tracks where cameras that should have seen them did not: whoever follows may be somebody else.
+
+        Returns, of each new track, the one that it was cut from.
+        """
+        before: dict[int, int] = {}
         first, last = self._extents()
         label, count, source = np.arange(len(self.tracks)), len(self.tracks), list(range(len(self.tracks)))
         unseen = np.zeros(len(self.tracks))
         for index, one in enumerate(smoothed):
             hit = one.row[one.hits > 0]
             for track in hit[unseen[hit] < LOG_ABSENT].tolist():
-                self._changed[index] = True
-                label[track] = count
+                before[count], label[track] = int(label[track]), count
                 source.append(track)
                 count += 1
             unseen[hit] = 0.0
@@ -268,6 +272,7 @@ class BatchSmoother:
             unseen[one.row[missed]] += one.odds[missed]
             self._rename(index, label)
         self._select(source)
+        return before
 
     def _exchange(self, forward: list[_Filtered], backward: list[_Filtered], width: int) -> None:
         """Exchange tracks that continue each other better if the ``width`` scans between are left out.
@@ -321,8 +326,11 @@ class BatchSmoother:
         tracks = self.tracks.select(np.array(source, dtype=np.int64))
         self.tracks = replace(tracks, initiation_number=np.arange(len(source)))
 
-    def _link(self, forward: list[_Filtered], backward: list[_Filtered]) -> None:
-        """The tracks' pasts assigned to the futures that continue them best, at every boundary of two scans."""
+    def _link(self, forward: list[_Filtered], backward: list[_Filtered], before: dict[int, int]) -> None:
+        """The tracks' pasts assigned to the futures that continue them best, at every boundary of two scans.
+
+        before: of tracks that were cut just now, what they were cut from: linked again, they have not changed.
+        """
         first, last = self._extents()
         n = len(self.tracks)
         label, count, source = np.arange(n), n, list(range(n))
@@ -363,6 +371,8 @@ class BatchSmoother:
                         source.append(tail)
                         count += 1
                 lost = [one for i, one in enumerate(pasts) if i not in set(follows.values())]
+            for tail in np.flatnonzero(first == index + 1).tolist():
+                self._changed[index + 1] |= tail in before and new[tail] != label[before[tail]]
             self._rename(index, label)
             label = new
         self._select(source)
@@ -387,23 +397,15 @@ class BatchSmoother:
         """Log odds (h, t) of tail t, at the scan after ``index``, continuing head h, last seen in scan ends[h]."""
         scan = self.scans[index + 1]
         past = self.tracks.select(heads)
-        mean, covariance, gap, ahead = (
-            past.mean.copy(),
-            past.covariance.copy(),
-            np.zeros(len(heads)),
-            np.zeros(len(heads)),
-        )
-        seen = past.mean[:, POSITION].copy()
+        mean, covariance = past.mean.copy(), past.covariance.copy()
         for at in np.unique(ends).tolist():
-            chosen = ends == at
-            rows = _places(forward[at].row, heads[chosen])
-            state = replace(past.select(chosen), mean=forward[at].mean[rows], covariance=forward[at].covariance[rows])
-            seen[chosen] = state.mean[:, POSITION]
-            elapsed = (scan.now_ns - self.scans[at].now_ns) / NANOSECONDS
-            state = on_floor(predict_targets(state, elapsed, self.parameters), self.floor, elapsed)
-            mean[chosen], covariance[chosen], ahead[chosen] = state.mean, state.covariance, elapsed
-            gap[chosen] = (self.scans[index].now_ns - self.scans[at].now_ns) / NANOSECONDS
-        past = replace(past, mean=mean, covariance=covariance)
+            rows = _places(forward[at].row, heads[chosen := ends == at])
+            mean[chosen], covariance[chosen] = forward[at].mean[rows], forward[at].covariance[rows]
+        ended = np.array([self.scans[at].now_ns for at in ends.tolist()], dtype=np.int64)
+        gap, ahead = (self.scans[index].now_ns - ended) / NANOSECONDS, (scan.now_ns - ended) / NANOSECONDS
+        seen = mean[:, POSITION]
+        past = predict_targets(replace(past, mean=mean, covariance=covariance), ahead, self.parameters)
+        past = on_floor(past, self.floor, ahead)
         rows = _places(after.row, tails)
         future = replace(self.tracks.select(tails), mean=after.mean[rows], covariance=after.covariance[rows])
         typical = float(np.median(self.tracks.mean[:, LOG_SIZE]))

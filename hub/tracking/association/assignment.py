@@ -9,7 +9,7 @@ from scipy.optimize import linear_sum_assignment
 
 from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter import kalman
-from hub.tracking.filter.kalman import LOG_SIZE
+from hub.tracking.filter.kalman import LOG_SIZE, STATE_DIM
 from hub.tracking.filter.measurement import (
     FOOT,
     HEAD,
@@ -76,16 +76,14 @@ def association_scores(
     value, noise: (m, 7), (m, 7, 7) measurements of the frame. names: labels of the targets. colour_std: of a channel.
     """
     n, m = len(targets), len(frame)
-    distance = np.full((n, m, 3), np.nan)
-    for part, rows in enumerate((POINT, HEAD, FOOT)):
-        jacobian = predicted.jacobian[:, rows]
-        own = jacobian @ targets.covariance @ jacobian.transpose(0, 2, 1) + predicted.model_noise[:, rows, rows]
-        both = own[:, None] + noise[None, :, rows, rows]
-        a, b, c = both[..., 0, 0], both[..., 0, 1], both[..., 1, 1]
-        off = value[None, :, rows] - predicted.value[:, None, rows]
-        x, y = off[..., 0], off[..., 1]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            distance[:, :, part] = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+    jacobian = predicted.jacobian[:, :LOG_IMAGE_SIZE].reshape(n, 3, 2, STATE_DIM)
+    own = jacobian @ targets.covariance[:, None] @ jacobian.swapaxes(2, 3) + _blocks(predicted.model_noise)
+    both = own[:, None] + _blocks(noise)
+    a, b, c = both[..., 0, 0], both[..., 0, 1], both[..., 1, 1]
+    off = (value[None, :, :LOG_IMAGE_SIZE] - predicted.value[:, None, :LOG_IMAGE_SIZE]).reshape(n, m, 3, 2)
+    x, y = off[..., 0], off[..., 1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        distance = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
     log_ratio = np.full((n, m), -np.inf)
     row, column = np.nonzero((distance[:, :, 0] < POINT_GATE) & (targets.kind[:, None] == frame.kind[None, :]))
     if not len(row):
@@ -103,6 +101,11 @@ def association_scores(
     if any(frame.target):
         log_ratio += _LOG_CAMERA_MATCH * (np.array(names)[:, None] == np.array(frame.target)[None, :])
     return AssociationScores(log_ratio, distance)
+
+
+def _blocks(matrix: Floats) -> Floats:
+    """The blocks (n, 3, 2, 2) of point, head and foot of covariances (n, 7, 7)."""
+    return np.stack([matrix[:, rows, rows] for rows in (POINT, HEAD, FOOT)], axis=1)
 
 
 def colour_score(observed: Floats, stored: Floats, std: float) -> Floats:

@@ -16,12 +16,12 @@ POSITION, VELOCITY, LOG_SIZE = slice(0, 3), slice(3, 6), 6
 def predict(
     mean: Floats,
     covariance: Floats,
-    elapsed: float,
+    elapsed: Floats | float,
     acceleration_psd: Floats,
     log_size_psd: float,
     velocity_psd: Floats | float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Predict states by ``elapsed`` seconds. A negative value extrapolates backwards but still adds process noise.
+    """Predict states by ``elapsed`` seconds, each or all. Negative: extrapolated backwards, process noise still adds.
 
     mean: (n, 7). covariance: (n, 7, 7). acceleration_psd: (n,) spectral density of the white acceleration [unit²/s³].
     velocity_psd: (n,) that of the white velocity beside it [unit²/s]. log_size_psd: that of the random walk of log size
@@ -29,17 +29,18 @@ def predict(
     Kirubarajan (2001), eqs. 6.2.2-12 and -13: two steps equal one step of their sum, so the result does not depend
     on the times at which other cameras capture.
     """
-    step = np.eye(STATE_DIM)
-    step[POSITION, VELOCITY] = elapsed * np.eye(3)
-    dt = abs(elapsed)
-    noise = np.zeros_like(covariance)
-    for axis in range(3):
-        noise[:, axis, axis] = acceleration_psd * (dt**3 / 3.0) + velocity_psd * dt
-        noise[:, axis, axis + 3] = acceleration_psd * (0.5 * dt * elapsed)
-        noise[:, axis + 3, axis] = acceleration_psd * (0.5 * dt * elapsed)
-        noise[:, axis + 3, axis + 3] = acceleration_psd * dt
-    noise[:, LOG_SIZE, LOG_SIZE] = log_size_psd * dt
-    return mean @ step.T, step @ covariance @ step.T + noise
+    dt, time = np.abs(elapsed), np.reshape(elapsed, (-1, 1))
+    mean, covariance, axis = mean.copy(), covariance.copy(), np.arange(3)
+    mean[:, POSITION] += time * mean[:, VELOCITY]
+    covariance[:, POSITION] += time[:, :, None] * covariance[:, VELOCITY]
+    covariance[:, :, POSITION] += time[:, :, None] * covariance[:, :, VELOCITY]
+    across = (acceleration_psd * (0.5 * dt * elapsed))[:, None]
+    covariance[:, axis, axis] += (acceleration_psd * (dt**3 / 3.0) + velocity_psd * dt)[:, None]
+    covariance[:, axis, axis + 3] += across
+    covariance[:, axis + 3, axis] += across
+    covariance[:, axis + 3, axis + 3] += (acceleration_psd * dt)[:, None]
+    covariance[:, LOG_SIZE, LOG_SIZE] += log_size_psd * dt
+    return mean, covariance
 
 
 def update(

@@ -19,6 +19,7 @@ from protocols.geometry.types import Bools, Floats
 
 _MAX_SPREAD_M = 0.7
 """Std of the position after a change: beyond, the target could be anywhere, and track initiation must find it again."""
+_STEP_S = 0.5  # of one step: 120 a minute
 _MANOEUVRE_STD = np.array([model.manoeuvre_std_m_s for model in TARGET_MODELS])
 _MANOEUVRE_RATE = np.array([model.manoeuvres_per_s for model in TARGET_MODELS])
 _UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
@@ -45,7 +46,8 @@ def manoeuvre_hypothesis(
     targets: predicted by ``elapsed`` (n,) [s], negative backwards in time. units_per_m: world units per metre. up: (3,)
     along which upright targets do not change their velocity. The time of the change is uniform over the time t, so the
     position variance grows by v t² / 3 and its covariance with the velocity by v t / 2, where v is the variance of the
-    velocity change.
+    velocity change. An upright target may also have taken a step and stand again: a change that lasted for a part of a
+    step's duration, or of t where that is shorter, uniform as well, adds v / 3 times its square.
     """
     time = np.broadcast_to(np.asarray(elapsed, dtype=np.float64), (len(targets),))
     std = _MANOEUVRE_STD[targets.kind] * units_of(targets, units_per_m)
@@ -54,7 +56,8 @@ def manoeuvre_hypothesis(
         axes = axes - _UPRIGHT[targets.kind][:, None, None] * np.outer(up, up)
     change = (std**2)[:, None, None] * axes
     covariance = targets.covariance.copy()
-    covariance[:, POSITION, POSITION] += change * (time**2 / 3.0)[:, None, None]
+    step = np.where(_UPRIGHT[targets.kind], np.minimum(np.abs(time), _STEP_S), 0.0)
+    covariance[:, POSITION, POSITION] += change * ((time**2 + step**2) / 3.0)[:, None, None]
     covariance[:, POSITION, VELOCITY] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, POSITION] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, VELOCITY] += change
@@ -86,11 +89,9 @@ def widened_by_evidence(
 
     information: (n, 7, 7) of the measurements, and its vector (n, 7).
     """
-    likelihoods = [
-        log_evidence(predicted.mean, covariance, information, vector)
-        for covariance in (predicted.covariance, hypothesis.covariance)
-    ]
-    return _mixed(predicted.covariance, hypothesis, *likelihoods)
+    covariances = np.concatenate([predicted.covariance, hypothesis.covariance])
+    twice = np.tile(predicted.mean, (2, 1)), covariances, np.tile(information, (2, 1, 1)), np.tile(vector, (2, 1))
+    return _mixed(predicted.covariance, hypothesis, *log_evidence(*twice).reshape(2, -1))
 
 
 def fused_predictions(

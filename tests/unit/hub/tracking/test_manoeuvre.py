@@ -18,7 +18,7 @@ from hub.tracking.filter.manoeuvre import (
     widened_by_evidence,
     within_reach,
 )
-from hub.tracking.filter.target_models import KIND_INDEX, MARKER
+from hub.tracking.filter.target_models import KIND_INDEX, MARKER, PERSON
 from hub.tracking.filter.target_states import Targets
 from hub.tracking.parameters import TrackerParameters
 from hub.tracking.tracker import Tracker
@@ -117,6 +117,17 @@ def test_people_set_off_and_stop_along_the_ground_and_sometimes() -> None:
     assert (added[[0, 1, 3, 4]] > 0.0).all()
     assert not added[[2, 5, 6]].any()
     assert 0.0 < manoeuvre.prior_odds[0] < 0.2
+
+
+def test_who_takes_one_step_and_stands_again_is_no_surprise() -> None:
+    """Half a metre aside at the former velocity, which a lasting change of velocity does not explain."""
+    tall = np.log(PERSON.size_m) * (np.arange(STATE_DIM) == STATE_DIM - 1)
+    person = replace(seen_before("person", 0.5), mean=tall[None], covariance=0.01 * np.eye(STATE_DIM)[None])
+    aside = 0.5 * (np.arange(STATE_DIM) == 0)
+    assert aside @ np.linalg.solve(manoeuvre_hypothesis(person, 0.5, 1.0).covariance[0], aside) < 3.0
+    slow, fast = (manoeuvre_hypothesis(person, elapsed, 1.0).covariance[0, 0, 0] for elapsed in (4.0, 1 / 60))
+    assert slow < 1.1 * 16.0 / 3.0, "a step has an end"
+    assert fast < 0.011, "and takes its time"
 
 
 @pytest.mark.parametrize("off", [0.1, 2.0])

@@ -24,6 +24,7 @@ from hub.tracking.frame_update import process_frame
 from hub.tracking.parameters import TrackerParameters
 from hub.tracking.tracker import Tracker
 from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
@@ -56,6 +57,26 @@ def person(camera: TrackingCamera, middle: Floats, time_ns: int, number: int, mi
         kind="person", covariance=[9.0, 0.0, 36.0], colour=pb.Colour(red=90, green=120, blue=60),
     )  # fmt: skip
     return message
+
+
+def test_a_box_in_a_rolled_camera_gives_head_and_foot_where_the_body_has_them() -> None:
+    """Also beside the picture's middle, and whatever the lens does to straight lines."""
+    curved = replace(LENS, distortions=np.array([-0.2, 0.05, 0.0, 0.0, 0.0]))
+    for roll, lens in itertools.product((0.0, 0.15, -0.6), (LENS, curved)):
+        pose = looking_at(np.array([4.0, 1.0, 2.6]), 0.9 * UP)
+        pose = replace(pose, rotation=so3.exp(roll * UP) @ pose.rotation, position=pose.position)
+        camera = TrackingCamera("cam", lens, pose, TimeMap())
+        message = pb.Observation(schema_version=1, camera="cam", boot_id="b")
+        middles = np.array([[-1.0, -1.0, 0.85], [0.0, 0.0, 0.85], [-1.0, 1.2, 0.85]])
+        for middle in middles:
+            ends = lens.project(pose.camera_from_world(middle + 0.5 * np.outer([1.0, -1.0], TALL * UP)))
+            u, (top, bottom) = float(ends[:, 0].mean()), ends[:, 1].tolist()
+            message.detections.add(u=u, v=0.5 * (top + bottom), head=[u, top], foot=[u, bottom], kind="person")
+        frame = frame_detections(camera, message)
+        seen = [pose.camera_from_world(middles + share * TALL * UP) for share in (0.5, -0.5)]
+        for found, true in zip((frame.slanted(UP).head, frame.slanted(UP).foot), seen, strict=True):
+            np.testing.assert_allclose(found, true[:, :2] / true[:, 2:], atol=0.01)
+        assert frame.slanted(None) is frame
 
 
 def test_occluded_feet_do_not_prevent_initiation() -> None:

