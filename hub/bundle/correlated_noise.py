@@ -90,7 +90,7 @@ def refit_with_correlated_noise(
             # The state may have been adjusted with other lenses, and its residuals contain their errors.
             found, start = nominal_problem, _with_nominal_lenses(nominal_problem, state)
             best = solve_gls(found, start, estimate_smoothness(found, start), noise_model)
-        if unmeasured or found is nominal_problem and refine_lenses:
+        if unmeasured or (found is nominal_problem and refine_lenses):
             noise_model = estimate_correlated_noise(found, best.state)
             best = solve_gls(found, best.state, estimate_smoothness(found, best.state), noise_model)
         rotation_std = _largest_rotation_std(found, best)
