@@ -103,8 +103,8 @@ def smooth_track(
     """Reject outliers of one track and smooth it; None with too few connected points.
 
     time: (n,) [s], increasing. normalised: (n, 2), undistorted; rows with NaN are left out.
-    time_origin: time that becomes 0; default the first row's time. relative_std: (n,) of the rows' noise over that of the
-    typical row, by the detector; None = all alike.
+    time_origin: time that becomes 0; default the first row's time. relative_std: (n,) of the rows' noise, relative to
+    the typical row, by the detector; None = all alike.
     """
     origin = float(time[0]) if time_origin is None and len(time) else float(time_origin or 0.0)
     shifted = time - origin
