@@ -80,34 +80,29 @@ def wide_console(markup: bool = False) -> Any:
 
 def print_summary(calibration: Calibration, out: Path) -> None:
     """Print a table of the cameras, the refused cameras, warnings and the paths of the written files."""
-    from rich.table import Table
-
-    console = wide_console()
     unit = calibration.units if calibration.scale == "metric" else "baselines"
-    table = Table(
-        title=f"{len(calibration.cameras)} cameras, {calibration.cpu_seconds:.1f} s of CPU", title_justify="left"
-    )
-    for column in ("camera", "lag [s]", "± [ms]", "rate [ppm]", "±", f"position [{unit}]", "±", "rms [px]"):
-        table.add_column(column, justify="left" if column == "camera" else "right")
-    for name, camera in calibration.cameras.items():
-        position = " ".join(f"{value:.3f}" for value in camera.pose.position)
-        table.add_row(
+    table = [("camera", "lag [s]", "± [ms]", "rate [ppm]", "±", f"position [{unit}]", "±", "rms [px]")]
+    table += [
+        (
             name + (" (reference)" if name == calibration.reference else ""),
             f"{camera.lag:.6f}",
             f"{1e3 * camera.lag_std:.3f}",
             f"{1e6 * (camera.time_map.clock_rate - 1.0):+.1f}",
             f"{1e6 * camera.clock_rate_std:.1f}",
-            position,
+            " ".join(f"{value:.3f}" for value in camera.pose.position),
             f"{float(max(camera.position_std)):.2g}",
             f"{camera.rms_px:.2f}",
         )
-    console.print(table)
+        for name, camera in calibration.cameras.items()
+    ]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    print(f"{len(calibration.cameras)} cameras, {calibration.cpu_seconds:.1f} s of CPU")
+    for name, *cells in table:  # plain: to import rich would cost a fiftieth of the whole command
+        print("  ".join((name.ljust(widths[0]), *map(str.rjust, cells, widths[1:]))))
     if any(camera.lag_std > 0.0 for camera in calibration.cameras.values()):
-        console.print(f"lag: {calibration.reference}'s time less the camera's, in the middle of their common span")
+        print(f"lag: {calibration.reference}'s time less the camera's, in the middle of their common span")
     for name, reason in calibration.refused.items():
-        console.print(f"refused {name}: {reason}", soft_wrap=True)
+        print(f"refused {name}: {reason}")
     for warning in calibration.warnings:
-        console.print(f"warning: {warning}", soft_wrap=True)
-    console.print(
-        f"written: {', '.join(str(out / name) for name in (CALIBRATION, TRAJECTORY, RESULT, REPORT))}", soft_wrap=True
-    )
+        print(f"warning: {warning}")
+    print(f"written: {', '.join(str(out / name) for name in (CALIBRATION, TRAJECTORY, RESULT, REPORT))}")

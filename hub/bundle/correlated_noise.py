@@ -37,7 +37,9 @@ from protocols.geometry.camera import Intrinsics
 from protocols.session.calibration import AdjustmentStep
 
 MIN_INFLATION = 4.0
-"""Variance inflation by autocorrelation (rows per effective row) from which the noise is modelled as correlated."""
+"""Variance inflation by autocorrelation (rows per effective row) from which the noise is modelled as correlated. With
+lenses that were not measured any significant one counts: what a path absorbs of a detector's slow errors, its residuals
+do not show, and weak directions of these lenses follow it against their priors."""
 _MAX_ROTATION_STD = 0.0175
 """Std [rad] of a camera's orientation above which correlated errors and trajectory cannot be distinguished."""
 _LENS = (FOCAL, CENTRE, CENTRE + 1, K1, K2, K3, ASPECT, P1, P1 + 1)
@@ -72,7 +74,9 @@ def refit_with_correlated_noise(
     excluded = state.jitter is not None or not problem.free_parameters.clock or not problem.free_parameters.pose
     if excluded or any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return problem, state
-    if correlation_inflation(problem, state).max() < min_inflation:
+    unmeasured = any(prior is not None for prior in problem.lens_priors)
+    inflation = float(correlation_inflation(problem, state).max())
+    if inflation <= 1.0 if unmeasured else inflation < min_inflation:
         return problem, state
     noise_model = estimate_correlated_noise(problem, state)
     if not is_tractable(problem, noise_model):
@@ -85,9 +89,10 @@ def refit_with_correlated_noise(
         if refine_lenses and prefers_nominal_lenses(found, best):
             # The state may have been adjusted with other lenses, and its residuals contain their errors.
             found, start = nominal_problem, _with_nominal_lenses(nominal_problem, state)
-            best = solve_gls(nominal_problem, start, estimate_smoothness(nominal_problem, start), noise_model)
-            noise_model = estimate_correlated_noise(nominal_problem, best.state)
-            best = solve_gls(nominal_problem, best.state, estimate_smoothness(nominal_problem, best.state), noise_model)
+            best = solve_gls(found, start, estimate_smoothness(found, start), noise_model)
+        if unmeasured or (found is nominal_problem and refine_lenses):
+            noise_model = estimate_correlated_noise(found, best.state)
+            best = solve_gls(found, best.state, estimate_smoothness(found, best.state), noise_model)
         rotation_std = _largest_rotation_std(found, best)
     except np.linalg.LinAlgError:
         return problem, state

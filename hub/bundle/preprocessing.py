@@ -124,13 +124,14 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
                     pixels = outline_to_centre(pixels, track.size, lens)
             time = track.time + readout * (np.clip(track.pixels[:, 1], 0, last_row) / last_row - 0.5)
             normalised = lens.unproject(pixels)
+            relative = _relative_stds(track, tracks)
             cleaned: ImageTrack | None
             if rig.shared_clock:
                 cleaned = sampled_track(track.time, normalised, lens.focal, time_origin)
             else:
                 # With a rolling shutter a false detection low in the image may get a later time than the next frame's.
                 rising = time if bool((np.diff(time) > 0).all()) else track.time
-                cleaned = smooth_track(rising, normalised, lens.focal, time_origin)
+                cleaned = smooth_track(rising, normalised, lens.focal, time_origin, relative)
             if cleaned is None:
                 continue
             smooth[track.label] = cleaned
@@ -143,7 +144,7 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
                     pixels,
                     use,
                     stamp=track.time - time_origin,
-                    relative_std=_relative_stds(track, tracks),
+                    relative_std=relative,
                 )
             )
         if not smooth:

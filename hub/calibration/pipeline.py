@@ -42,7 +42,6 @@ from hub.calibration.solution import Solution
 from hub.calibration.unconnected import connect_by_resection
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
 from hub.clocks.external_prior import ExternalClockPrior
-from hub.clocks.step_correction import SAME_STEP_S
 from hub.sync.hypothesis import PairSolution
 from hub.trajectory.image_tracks import smooth_only
 from hub.two_view.relative_pose import fundamental_from
@@ -481,14 +480,16 @@ def _with_clock_steps(
             trial, trial_state, _ = adjust(
                 model_comparison.with_clock_step(problem, step, middle), trial_state, rounds=2
             )
-            more = model_comparison.find_clock_step(trial, trial_state, against_lenses)
-            if more is None or more.camera != step.camera or abs(more.time - step.time) > SAME_STEP_S or not left:
+            rest = model_comparison.remaining_step(trial, trial_state, step.camera, step.time)
+            step = replace(step, std=rest.std)
+            if abs(rest.size) < rest.std or not left:
                 break
             # The size is of one Gauss-Newton step, which leaves a part of a large one.
-            step = replace(step, size=step.size + more.size)
+            step = replace(step, size=step.size + rest.size)
         if not bic_prefers(trial, trial_state, problem, state):
             break
-        problem, state, step = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step)), more
+        problem, state = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step))
+        step = model_comparison.find_clock_step(problem, state, against_lenses)
     return problem, state
 
 

@@ -340,7 +340,7 @@ def _time_map_std(
 ) -> float:
     if not problem.free_parameters.clock or camera == reference:
         return 0.0
-    return _with_jitter(cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference)
+    return _with_stamp_errors(cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference)
 
 
 def _lag_std(
@@ -350,16 +350,21 @@ def _lag_std(
     if not problem.free_parameters.clock or camera == reference:
         return 0.0
     std = float(cov.relative_clock_stds(covariance, problem, state)[camera, reference])
-    return _with_jitter(std / state.cameras[reference].rate, problem, state, camera, reference)
+    return _with_stamp_errors(std / state.cameras[reference].rate, problem, state, camera, reference)
 
 
-def _with_jitter(std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int) -> float:
+def _with_stamp_errors(std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int) -> float:
     variance = std**2
     if state.jitter is not None:
         # The map refers to the mean time stamp: its variance includes that of the mean of so many jittered stamps.
         for one in (camera, reference):
             stamps = [rows.stamps[rows.use] for rows in problem.rows if rows.camera == one]
             variance += float(state.jitter[one]) ** 2 / max(len(np.unique(np.concatenate(stamps))), 1)
+    for step in state.clock_steps:
+        if step.camera in (camera, reference):  # its size moves the map by the share of the rows beyond it
+            rows = [rows.time[rows.use] for rows in problem.rows if rows.camera == step.camera]
+            after = float(np.mean(np.concatenate(rows) >= step.time))
+            variance += (step.std * (after if step.time > state.cameras[step.camera].centre else 1.0 - after)) ** 2
     return float(np.sqrt(variance))
 
 

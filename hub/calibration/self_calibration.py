@@ -174,7 +174,7 @@ def with_lens(prepared: PreparedSession, name: str, lens: Intrinsics, prior: Len
 
 
 def _smooth(part: TrackObservations, lens: Intrinsics) -> SmoothTrack | None:
-    return smooth_track(part.time, lens.unproject(part.pixels), lens.focal, 0.0)
+    return smooth_track(part.time, lens.unproject(part.pixels), lens.focal, 0.0, part.relative_std)
 
 
 def _with_relative_pose(

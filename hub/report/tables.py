@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import sys
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 from protocols.session.rig import Rig
 
-_LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "plotly")
+_LIBRARIES = {"numpy": "numpy", "scipy": "scipy", "OpenCV": "cv2"}
 _MAX_TESTS = 1000  # rows of the table of tests, of a hundred pairs
 _MAX_UNFOLDED = 30  # more pairs than this are folded away
 _SIGNS = {"agrees": "✓ consistent", "contradicts": "≠ contradicts the others", "refused": "✕"}
@@ -182,14 +183,10 @@ def _capital(text: str) -> str:
 
 def provenance(facts: dict[str, str], rig: Rig, command: str) -> str:
     """Provenance: command, input, versions."""
-    from importlib import metadata  # 15 ms, most of it the standard library's e-mail parser
-
-    versions = [f"Python {platform.python_version()}"]
-    for name in _LIBRARIES:
-        try:
-            versions.append(f"{name} {metadata.version(name)}")
-        except metadata.PackageNotFoundError:
-            continue
+    # Of the modules, as far as they are loaded: importlib.metadata costs 15 ms, most of it for the e-mail parser.
+    loaded = ((name, sys.modules.get(module)) for name, module in _LIBRARIES.items())
+    versions = [f"{name} {module.__version__}" for name, module in loaded if module is not None]
+    versions.insert(0, f"Python {platform.python_version()}")
     rows = {
         **({"Command": f"<code>{esc(command)}</code>"} if command else {}),
         **{key: esc(value) for key, value in facts.items() if value},

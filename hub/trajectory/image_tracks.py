@@ -98,12 +98,13 @@ ImageTrack: TypeAlias = SmoothTrack | SampledTrack
 
 
 def smooth_track(
-    time: Floats, normalised: Floats, focal: float, time_origin: float | None = None
+    time: Floats, normalised: Floats, focal: float, time_origin: float | None = None, relative_std: Floats | None = None
 ) -> SmoothTrack | None:
     """Reject outliers of one track and smooth it; None with too few connected points.
 
     time: (n,) [s], increasing. normalised: (n, 2), undistorted; rows with NaN are left out.
-    time_origin: time that becomes 0; default the first row's time.
+    time_origin: time that becomes 0; default the first row's time. relative_std: (n,) of the rows' noise, relative to
+    the typical row, by the detector; None = all alike.
     """
     origin = float(time[0]) if time_origin is None and len(time) else float(time_origin or 0.0)
     shifted = time - origin
@@ -112,6 +113,7 @@ def smooth_track(
         return None
     rows = np.flatnonzero(usable)
     t, x = shifted[rows], normalised[rows]
+    std = np.ones(len(rows)) if relative_std is None else relative_std[rows]
     good = neighbour_test(t, x, floor=_MIN_OUTLIER_PX / focal)
     interval = float(np.median(np.diff(t)))
     gap = max(BRIDGED_GAP_S, BRIDGED_INTERVALS * interval)
@@ -121,14 +123,14 @@ def smooth_track(
         spacing = float(np.clip(factor * interval, *_SPACING_LIMITS))
         if best is not None and spacing == best.basis.spacing:
             continue
-        fit = _robust_fit(t, x, good, discontinuities, spacing, _STIFFNESS, gap, focal)
+        fit = _robust_fit(t, x, std, good, discontinuities, spacing, _STIFFNESS, gap, focal)
         if fit is not None and (best is None or fit.score < best.score):
             best = fit
     if best is not None and (
         best.basis.spacing <= max(_SPACINGS[0] * interval, _SPACING_LIMITS[0]) or best.sigma * focal > _UNDERFIT_PX
     ):
         for stiffness in _FINE_STIFFNESS:
-            fit = _robust_fit(t, x, good, discontinuities, _FINE_SPACING * interval, stiffness, gap, focal)
+            fit = _robust_fit(t, x, std, good, discontinuities, _FINE_SPACING * interval, stiffness, gap, focal)
             if fit is not None and fit.score < best.score:
                 best = fit
     if best is None:
@@ -250,6 +252,7 @@ def _discontinuities(t: Floats, x: Floats, good: Bools) -> Floats:
 def _robust_fit(
     t: Floats,
     x: Floats,
+    std: Floats,
     good: Bools,
     discontinuities: Floats,
     spacing: float,
@@ -269,8 +272,8 @@ def _robust_fit(
             return None
         begins, ends = split_at_gaps(t[inlier], gap, part_index[inlier])
         basis = SplineBasis.spanning(begins, ends, spacing)
-        control = fit_spline(basis, t[inlier], x[inlier], np.ones(count), stiffness=stiffness)
-        residual = np.linalg.norm(basis.evaluate(control, t) - x, axis=1)
+        control = fit_spline(basis, t[inlier], x[inlier], std[inlier] ** -2.0, stiffness=stiffness)
+        residual = np.linalg.norm(basis.evaluate(control, t) - x, axis=1) / std
         counts = np.diff(np.searchsorted(t[inlier], np.r_[begins, np.inf]))
         degrees_of_freedom = _degrees_of_freedom(counts, basis.intervals + 3, stiffness)
         n = float(count)

@@ -28,6 +28,7 @@ import numpy as np  # noqa: E402
 from deploy.agents.malloc_tuning import retain_freed_memory  # noqa: E402
 from hub.bundle.preprocessing import prepare  # noqa: E402
 from hub.calibration.pipeline import calibrate  # noqa: E402
+from hub.clocks.step_correction import on_newest_clock, on_newest_side  # noqa: E402
 from hub.trajectory.image_tracks import SmoothTrack  # noqa: E402
 from protocols.core.clocks import TimeMap  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
@@ -240,7 +241,7 @@ def cut(data: Path) -> None:
         for flight in ("drone1", "drone2"):
             rig = read_rig(data / flight / "rig.toml")
             observations = read_observations(data / flight / "observations.csv", rig.cameras)
-            cameras = _all_seen(rig, observations)
+            observations, cameras = _all_seen(rig, observations)
             for (one, a), (other, b) in itertools.combinations(cameras.items(), 2):
                 span_a, span_b = (seen.reference(seen.track.time[[0, -1]]) for seen in (a, b))
                 begin, end = max(span_a[0], span_b[0]), min(span_a[1], span_b[1])
@@ -260,8 +261,11 @@ def cut(data: Path) -> None:
         )
 
 
-def _all_seen(rig: Rig, observations: Observations) -> dict[str, _Seen]:
+def _all_seen(rig: Rig, observations: Observations) -> tuple[Observations, dict[str, _Seen]]:
+    """The observations with the clock steps of the whole flight corrected, and its cameras."""
     whole = calibrate(rig, observations)
+    steps = {name: camera.clock_steps for name, camera in whole.cameras.items() if camera.clock_steps}
+    whole, observations = on_newest_side(whole), on_newest_clock(observations, steps)
     prepared = prepare(rig, observations)
     out = {}
     for name, camera in whole.cameras.items():
@@ -269,7 +273,7 @@ def _all_seen(rig: Rig, observations: Observations) -> dict[str, _Seen]:
         lens = rig.cameras[name].intrinsics
         if isinstance(smooth, SmoothTrack) and lens is not None:
             out[name] = _Seen(observations.of_camera(name)[0], smooth, lens, camera.time_map)
-    return out
+    return observations, out
 
 
 def _solve_cut(rig: Rig, observations: Observations, seen: dict[str, _Seen], first: float, last: float) -> float | None:

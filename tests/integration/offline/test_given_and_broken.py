@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,15 @@ from hub.sync.pair_solver import _PairSearch
 from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.session.calibration import Calibration, FixedCalibration
+from protocols.session.folder import read_folder
 from protocols.session.observations import gather_tracks
 from protocols.session.result import result_document
 from protocols.session.rig import Rig, RigCamera
 from tests.bench import broken_cameras
 from tests.bench.pose_worlds import FOCAL, cube, errors, joint_optimum, observe, section_4
 from tests.support import rigs
+
+DRONE2 = Path(__file__).parents[4] / "shared" / "data" / "drone2"
 
 
 def of(session: rigs.Session, name: str) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
@@ -166,7 +170,7 @@ def test_a_camera_that_shares_no_moment_with_the_first_pair_is_connected() -> No
 def test_a_clock_step_is_reported_with_time_and_size_and_no_other_clock_follows(
     four: tuple[rigs.Session, Calibration],
 ) -> None:
-    session, _ = four
+    session, before = four
     mine = of(session, "cam2")
     at = float(np.quantile(session.time[mine], 0.6))
     time = session.time + np.where(mine & (session.time >= at), 0.03, 0.0)
@@ -174,10 +178,32 @@ def test_a_clock_step_is_reported_with_time_and_size_and_no_other_clock_follows(
     ((when, size, std),) = found.cameras["cam2"].clock_steps
     assert when == pytest.approx(at, abs=0.7)
     assert abs(size - 0.03) < 3.0 * std
-    assert [text for text in found.warnings if text.startswith("cam2: its clock steps by +29.")]
+    assert [text for text in found.warnings if text.startswith("cam2: its clock steps by +30.")]
+    assert found.cameras["cam2"].lag_std > 1.3 * before.cameras["cam2"].lag_std  # it holds the size's
     for name, camera in found.cameras.items():
         assert camera.readout == 0.0
         assert abs(session.clock_error(name, found.reference, camera.time_map)) <= 5.0 * camera.time_offset_std
+
+
+@pytest.mark.skipif(not DRONE2.is_dir(), reason="no recording in ../shared/data")
+def test_clock_steps_in_a_recorded_flight_are_reported_with_time_and_size() -> None:
+    """Of cam0 at 69 s, as recorded; a further one put into another camera's stamps is no part of the first one's."""
+    rig, observations = read_folder(DRONE2)
+    before = calibrate(rig, observations)
+    ((at, size, std),) = before.cameras["cam0"].clock_steps
+    assert at == pytest.approx(69.0, abs=1.0)
+    assert abs(size + 0.0326) < 3.0 * std
+    (key,) = (key for key in observations.tracks if key[0] == "cam1")
+    track = observations.tracks[key]
+    put = float(track.time[0] + 0.4 * np.ptp(track.time))
+    stamps = track.time - np.where(track.time >= put, 0.06, 0.0)
+    shown = np.diff(np.maximum.accumulate(stamps), prepend=-np.inf) > 0.0
+    stepped = replace(track, time=stamps).select(shown)
+    after = calibrate(rig, replace(observations, tracks={**observations.tracks, key: stepped}))
+    ((at, size, std),) = after.cameras["cam1"].clock_steps
+    assert at == pytest.approx(put, abs=1.0)
+    assert abs(size + 0.06) < 4.0 * std < 0.01
+    assert all(camera.readout == 0.0 for camera in after.cameras.values())
 
 
 def test_a_readout_is_neither_negative_nor_longer_than_a_frame(four: tuple[rigs.Session, Calibration]) -> None:

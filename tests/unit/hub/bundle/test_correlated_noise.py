@@ -11,9 +11,10 @@ from scipy.stats import multivariate_normal
 from hub.bundle import correlated_noise
 from hub.bundle.adjustment import adjust, apply_step, residual_norms
 from hub.bundle.correlated_noise import lens_tolerance, prefers_nominal_lenses, refit_with_correlated_noise
+from hub.bundle.covariance import covariance
 from hub.bundle.gauss_markov import GaussMarkov, estimate_correlated_noise, fit_maximum_likelihood
 from hub.bundle.gls import GlsSolution, SparseEntries, gls_cost, is_tractable, solve_gls
-from hub.bundle.noise_scale import modelled_inflation, rescale_noise
+from hub.bundle.noise_scale import correlation_inflation, modelled_inflation, rescale_noise
 from hub.bundle.problem import (
     CAMERA_PARAMETERS,
     FOCAL,
@@ -25,6 +26,7 @@ from hub.bundle.problem import (
     Trajectory,
 )
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
+from hub.calibration.result import focal_stds
 from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
@@ -188,6 +190,24 @@ def test_independent_errors_leave_everything_as_it_is() -> None:
     after = refit_with_correlated_noise(problem, state, refine_lenses=True)
     assert after[0] is problem
     assert after[1] is state
+
+
+def test_a_slight_correlation_counts_where_lenses_were_not_measured() -> None:
+    """Weak directions of such lenses follow errors that the path absorbs: as independent rows, they pull too much."""
+    problem, truth = rig(13, correlated_px=0.2)
+    problem, state, _ = adjust(problem, truth, rounds=2, iterations=10)
+    slight = 2.0 * float(correlation_inflation(problem, state).max())
+    assert refit_with_correlated_noise(problem, state, min_inflation=slight)[1] is state
+    priors = tuple(replace(lens_tolerance(lens), focal_std=0.4, k1_std=0.15) for lens in problem.nominal)
+    free, estimated, _ = adjust(replace(problem, lens_priors=priors), state, rounds=2, iterations=10)
+    after = refit_with_correlated_noise(free, estimated, min_inflation=slight)[1]
+    assert after.correlated_noise is not None
+
+    def focal_std(one: AdjustmentState) -> float:
+        scaled = rescale_noise(free, one, estimate_smoothness(free, one))
+        return float(focal_stds(free, scaled, covariance(free, scaled, estimate_smoothness(free, scaled))).mean())
+
+    assert focal_std(after) > 1.2 * focal_std(estimated)
 
 
 @pytest.mark.parametrize(("focal_scale", "free_lenses"), [(1.0, False), (1.02, True)])

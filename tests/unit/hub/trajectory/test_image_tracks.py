@@ -303,3 +303,18 @@ def test_a_scaled_track_shows_the_same_points_later() -> None:
     np.testing.assert_allclose(point, found.at(when), atol=1e-12)
     np.testing.assert_allclose(1.25 * speed, found.at(when, 1), atol=1e-9)
     assert slow.span == pytest.approx(1.25 * found.span)
+
+
+def test_rows_weigh_as_the_detector_says() -> None:
+    """Half of the rows have six times the noise: smoothed by their stds, the track is nearer to the truth."""
+    rng = np.random.default_rng(5)
+    time = np.arange(600) / 30.0
+    truth = 0.2 * np.column_stack([np.sin(2.1 * time), np.cos(1.3 * time)])
+    relative = np.where(rng.random(len(time)) < 0.5, 1.0, 6.0)
+    points = truth + rng.normal(0.0, 0.5 / FOCAL, truth.shape) * relative[:, None]
+    errors = []
+    for stds in (None, relative):
+        found = smooth_track(time, points, FOCAL, relative_std=stds)
+        assert found is not None
+        errors.append(float(np.sqrt(np.nanmean((found.at(time) - truth) ** 2))))
+    assert errors[1] < 0.75 * errors[0]
