@@ -31,7 +31,7 @@ def test_the_predicted_place_is_as_uncertain_as_it_says() -> None:
         place, velocity = np.zeros(2), rng.normal(0.0, 1.5 * length, 2)
         kalman, measured = VelocityFilter(length), np.zeros(2)
         for k in range(40):
-            power = 0.1 * length**2 + 0.1 * np.square(velocity).sum()  # what moves turns and brakes more than what stands
+            power = 0.1 * length**2 + 0.1 * np.square(velocity).sum()  # what moves turns and brakes more
             velocity = velocity + rng.normal(0.0, np.sqrt(power * dt), 2)
             place = place + velocity * dt
             predicted = measured + kalman.predict(dt, length)
