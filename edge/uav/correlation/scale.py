@@ -69,14 +69,12 @@ class BoxFlow:
         if near.sum() < _MIN_POINTS:
             return none
         p, q = p[near], q[near]
-        # A flow is as precise as the image's own pixels: magnified, its points are worth less.
-        prior = _FLOW_PRIOR * max(1.0, per_pixel)
-        wider, skew = _slope(p, q[:, 0], 0, prior)
-        higher, skew_y = _slope(p, q[:, 1], 1, prior)
+        wider, skew = _slope(p, q[:, 0], 0)
+        higher, skew_y = _slope(p, q[:, 1], 1)
         return wider, higher, 0.5 * (skew_y - skew)
 
 
-def _slope(old: Floats, new: Floats, axis: int, prior: float) -> tuple[float, float]:
+def _slope(old: Floats, new: Floats, axis: int) -> tuple[float, float]:
     """Robust derivatives of one new coordinate by the same and by the other old one, with a prior of 1 and 0."""
     spread = np.square(old - np.median(old, axis=0)).mean(axis=0)
     step: Floats = np.zeros(2)
@@ -88,7 +86,7 @@ def _slope(old: Floats, new: Floats, axis: int, prior: float) -> tuple[float, fl
         scale = max(float(np.median(np.abs(residual))), 0.1)
         weight = np.asarray(1.0 / (1.0 + np.square(residual / (2.0 * scale))), np.float64)
         centred = old - np.average(old, axis=0, weights=weight)
-        normal = centred.T @ (weight[:, None] * centred) + np.diag(prior * spread + 1e-6)
+        normal = centred.T @ (weight[:, None] * centred) + np.diag(_FLOW_PRIOR * spread + 1e-6)
         step = np.asarray(np.linalg.solve(normal, centred.T @ (weight * change)), np.float64)
     slope = float(np.clip(1.0 + step[axis], 1.0 / _MAX_STEP, _MAX_STEP))
     return slope, float(np.clip(step[1 - axis], -_MAX_TURN, _MAX_TURN))

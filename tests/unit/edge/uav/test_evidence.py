@@ -31,7 +31,8 @@ def test_the_predicted_place_is_as_uncertain_as_it_says() -> None:
         place, velocity = np.zeros(2), rng.normal(0.0, 1.5 * length, 2)
         kalman, measured = VelocityFilter(length), np.zeros(2)
         for k in range(40):
-            velocity = velocity + rng.normal(0.0, np.sqrt(0.8 * dt) * length, 2)
+            power = 0.1 * length**2 + 0.1 * np.square(velocity).sum()  # what moves turns and brakes more
+            velocity = velocity + rng.normal(0.0, np.sqrt(power * dt), 2)
             place = place + velocity * dt
             predicted = measured + kalman.predict(dt, length)
             if k < 25:
