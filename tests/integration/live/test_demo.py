@@ -55,6 +55,7 @@ def test_its_log_is_complete_and_gives_the_same_calibration(
     assert first == (tmp_path / "two" / "calibration.toml").read_bytes()
     (live, reference), (again, _) = _time_maps(out / "calibration.toml"), _time_maps(tmp_path / "one/calibration.toml")
     stated = json.loads((out / "result.json").read_text())["cameras"]
+    assert live.keys() == again.keys() == {"cam0", "cam1", "cam2"}
     for name in live.keys() - {reference}:
         # Both speak of the same clocks: compare where they film, not at the epoch of the clock.
         own = CameraTime(stated[name]["lag_time_s"])
