@@ -106,12 +106,13 @@ class BoardDetector:
         rows, columns = (count - 1 for count in self._board.squares or (0, 0))
         whole = 0, 0, grey.shape[1], grey.shape[0]
         levels = [(whole, SEARCH_PX // 2), (whole, SEARCH_PX), *([(tile, SEARCH_PX)] if tile else [])]
-        for (x, y, right, bottom), longest in levels:
+        for box, longest in levels:
+            x, y, right, bottom = box
             part = grey[y:bottom, x:right]
             scale = min(longest / max(part.shape), 1.0)
             level = np.asarray(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
             for low, high in linked_saddles(level, max(rows * columns // 2, 4))[:_MOST_GROUPS]:
-                corners = self._search_around(grey, low / scale + [x, y], high / scale + [x, y], (x, y, right, bottom) == whole)
+                corners = self._search_around(grey, low / scale + [x, y], high / scale + [x, y], box == whole)
                 if len(corners[0]):
                     return corners
         return NOTHING
