@@ -1,7 +1,8 @@
 """Detector of a board's corners in the images of one camera: an image pyramid, and tracking between full searches.
 
 The board is searched in an image of at most ``SEARCH_PX``; where it was a moment ago, only its surroundings are
-searched, at the resolution at which it is large enough. Corners are then refined in the full image. Small images of
+searched, at the resolution at which it is large enough; while it is nowhere, a tile of the full image a frame, too.
+Corners are then refined in the full image. Small images of
 boards with tags are enlarged: the bits of a tag 14 px wide are two pixels, and next to its corners are others.
 """
 
@@ -25,8 +26,11 @@ _TRACK_PX, _TRACK_PX_OF_TAGS = 640, 960  # … in which the surroundings of the 
 _ENLARGED = 2.0  # at most
 _MARGIN = 1.0  # of the board's extent around its last place
 _KEPT_SHARE = 0.8  # fewer of the corners of the last frame: the whole frame is searched
-_FULL_EVERY = 8  # frames without a board between searches at full resolution
+_TILES = 3  # each way, half an image wide and high: one a frame is searched at full resolution while no board is seen
 _MOST_GROUPS = 4  # of saddle points, searched at each level
+
+Box = tuple[int, int, int, int]
+"""A part of an image: x, y, right, bottom [px]."""
 
 
 class BoardDetector:
@@ -63,9 +67,8 @@ class BoardDetector:
         """Numbers and pixels of the corners in the next image (H, W) of this camera."""
         corners = self._search_nearby(grey)
         if corners is None:
-            finest = self._missed % _FULL_EVERY == 0 and max(grey.shape) > SEARCH_PX
             search = self._search_saddles if self._board.kind == "chessboard" else self._search_whole
-            corners = search(grey, finest)
+            corners = search(grey, self._tile(grey.shape) if max(grey.shape) > SEARCH_PX else None)
         found = len(corners[0]) > 0
         if found and self._board.symmetric:
             corners = corners[0], self._as_before(corners[1])
@@ -81,22 +84,35 @@ class BoardDetector:
         self._order = pixels
         return pixels
 
-    def _search_whole(self, grey: Grey, finest: bool) -> Corners:
-        """The corners in the reduced image, and where none are and ``finest``, in the full one."""
-        corners = self._search(grey, (0, 0, grey.shape[1], grey.shape[0]), SEARCH_PX, False)
-        return self._finder.find(grey) if finest and not len(corners[0]) else corners
+    def _tile(self, shape: tuple[int, ...]) -> Box:
+        """The part of the image whose turn it is, the middle first: a board of a quarter of the image is in one."""
+        row, column = divmod((4 + 4 * self._missed) % _TILES**2, _TILES)
+        height, width = shape
+        x, y = (count * place // (2 * (_TILES - 1)) for count, place in ((width, column), (height, row)))
+        return x, y, x + width // 2, y + height // 2
 
-    def _search_saddles(self, grey: Grey, finest: bool) -> Corners:
-        """The corners of a chessboard around the groups of saddle points of a pyramid; finest: and of one more level.
+    def _search_whole(self, grey: Grey, tile: Box | None) -> Corners:
+        """The corners in the reduced image, and where none are, in a tile of the full one."""
+        corners = self._search(grey, (0, 0, grey.shape[1], grey.shape[0]), SEARCH_PX, False)
+        if tile is None or len(corners[0]):
+            return corners
+        return self._search(grey, tile, max(grey.shape) // 2, False)
+
+    def _search_saddles(self, grey: Grey, tile: Box | None) -> Corners:
+        """The corners of a chessboard around the groups of saddle points of a pyramid, whose last level is of a tile.
 
         OpenCV's finders take seconds for an image with much texture and no board.
         """
         rows, columns = (count - 1 for count in self._board.squares or (0, 0))
-        for longest in (SEARCH_PX, SEARCH_PX // 2, *([2 * SEARCH_PX] if finest else [])):
-            scale = min(longest / max(grey.shape), 1.0)
-            level = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        whole = 0, 0, grey.shape[1], grey.shape[0]
+        levels = [(whole, SEARCH_PX // 2), (whole, SEARCH_PX), *([(tile, SEARCH_PX)] if tile else [])]
+        for box, longest in levels:
+            x, y, right, bottom = box
+            part = grey[y:bottom, x:right]
+            scale = min(longest / max(part.shape), 1.0)
+            level = np.asarray(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
             for low, high in linked_saddles(level, max(rows * columns // 2, 4))[:_MOST_GROUPS]:
-                corners = self._search_around(grey, low / scale, high / scale, longest <= SEARCH_PX)
+                corners = self._search_around(grey, low / scale + [x, y], high / scale + [x, y], box == whole)
                 if len(corners[0]):
                     return corners
         return NOTHING
@@ -116,8 +132,8 @@ class BoardDetector:
         most = _TRACK_PX if self._board.kind == "chessboard" else _TRACK_PX_OF_TAGS
         return self._search(grey, (x, y, right, bottom), most, thorough)
 
-    def _search(self, grey: Grey, box: tuple[int, int, int, int], most: int, thorough: bool) -> Corners:
-        """The corners in a part x, y, right, bottom of the image, reduced to ``most`` pixels."""
+    def _search(self, grey: Grey, box: Box, most: int, thorough: bool) -> Corners:
+        """The corners in a part of the image, reduced to ``most`` pixels."""
         x, y, right, bottom = box
         part = np.ascontiguousarray(grey[y:bottom, x:right])
         if min(part.shape) < 24:

@@ -171,6 +171,17 @@ def test_a_large_image_gives_the_corners_of_full_resolution() -> None:
     assert np.abs(pixels[a] - full[b]).max() < 0.25
 
 
+@pytest.mark.parametrize("place", [(300, 200), (2000, 900), (3300, 1700)])
+def test_a_board_too_small_for_the_reduced_image_is_found_within_nine_frames(place: tuple[int, int]) -> None:
+    board = parse_board({"board": "charuco", "squares": "8x6", "inverted": False, "mirrored": False, "legacy": False})
+    grey = np.full((2160, 3840), 120, np.uint8)
+    small = cv2.resize(boards.charuco_image(), (256, 192), interpolation=cv2.INTER_AREA)
+    grey[place[1] : place[1] + 192, place[0] : place[0] + 256] = small
+    detector = BoardDetector(board)
+    assert max(len(detector.find(grey)[0]) for _ in range(9)) == 35
+    assert len(detector.find(grey)[0]) == 35  # tracked from then on
+
+
 def _corner_errors(kind: str, focal: float) -> np.ndarray:
     """Errors [px] of the corners found in 8 views of a board by a camera of 640x480."""
     lens = Intrinsics(640, 480, np.array([[focal, 0.0, 319.5], [0.0, focal, 239.5], [0.0, 0.0, 1.0]]))
