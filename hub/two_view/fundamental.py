@@ -7,6 +7,7 @@ step; convention ``m_aᵀ F m_b = 0`` (asynchronous calibration paper, eq. 5).
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from protocols.core.errors import Refused
 from protocols.geometry import so3
@@ -52,29 +53,20 @@ def maximum_likelihood_fundamental(a: Floats, b: Floats, start: Floats | None = 
     hb = np.column_stack([b, np.ones(len(b))]) @ tb.T
     u, d, vt = np.linalg.svd(np.linalg.inv(ta).T @ first @ np.linalg.inv(tb))
     u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
-    angle = float(np.arctan2(d[1], d[0]))
-    damping = 1e-3
-    residual, jacobian = _residuals(u, vt, angle, ha, hb, inverse_scale)
-    cost = float(residual @ residual)
-    for _ in range(iterations):
-        normal = jacobian.T @ jacobian
-        step: Floats = np.asarray(
-            np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -jacobian.T @ residual), np.float64
-        )
-        trial = (so3.exp(step[:3]) @ u, vt @ so3.exp(-step[3:6]), angle + float(step[6]))
-        new_residual, new_jacobian = _residuals(*trial, ha, hb, inverse_scale)
-        new_cost = float(new_residual @ new_residual)
-        if new_cost < cost:
-            gain = cost - new_cost
-            (u, vt, angle), residual, jacobian, cost = trial, new_residual, new_jacobian, new_cost
-            damping = max(damping / 10.0, 1e-12)
-            if gain < 1e-12 * max(cost, 1e-300):
-                break
-        else:
-            damping *= 10.0
-            if damping > 1e8:
-                break
-    matrix = ta.T @ _compose(u, vt, angle) @ tb
+    angle = np.arctan2(d[1], d[0])
+
+    def compose(step: Floats) -> Floats:
+        singular = np.array([np.cos(angle + step[6]), np.sin(angle + step[6]), 0.0])
+        return np.asarray((so3.exp(step[:3]) @ u * singular) @ vt @ so3.exp(-step[3:6]))
+
+    def residuals(step: Floats) -> Floats:
+        la, lb = hb @ compose(step).T, ha @ compose(step)
+        # The two images are scaled by different factors: weighted back to pixels of one size.
+        variance = (la[:, :2] ** 2).sum(1) * inverse_scale**2 + (lb[:, :2] ** 2).sum(1)
+        return np.asarray((ha * la).sum(1) / np.sqrt(np.maximum(variance, 1e-300)))
+
+    found = least_squares(residuals, np.zeros(7), "3-point", xtol=1e-12, ftol=1e-12, gtol=None, max_nfev=iterations)
+    matrix = ta.T @ compose(found.x) @ tb
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
@@ -87,30 +79,3 @@ def epipolar_lines(matrix: Floats, a: Floats) -> Floats:
 def line_distances(lines: Floats, points: Floats) -> Floats:
     """Signed distances (n,) of points (n, 2) from unit-normal lines (n, 3) [px]."""
     return np.asarray((lines[:, :2] * points).sum(axis=1) + lines[:, 2])
-
-
-def _compose(u: Floats, vt: Floats, angle: float) -> Floats:
-    return np.asarray((u * np.array([np.cos(angle), np.sin(angle), 0.0])) @ vt)
-
-
-def _residuals(
-    u: Floats, vt: Floats, angle: float, ha: Floats, hb: Floats, inverse_scale: float
-) -> tuple[Floats, Floats]:
-    """Sampson residuals (n,) and their Jacobian (n, 7) by central differences, denominators included."""
-
-    def value(matrix: Floats) -> Floats:
-        la, lb = hb @ matrix.T, ha @ matrix
-        # The two images are scaled by different factors: weighted back to pixels of one size.
-        variance = (la[:, :2] ** 2).sum(1) * inverse_scale**2 + (lb[:, :2] ** 2).sum(1)
-        return np.asarray((ha * la).sum(1) / np.sqrt(np.maximum(variance, 1e-300)))
-
-    jacobian = np.empty((len(ha), 7))
-    step = 1e-6
-    for k in range(3):
-        turn = so3.exp(step * np.eye(3)[k])
-        jacobian[:, k] = (value(_compose(turn @ u, vt, angle)) - value(_compose(turn.T @ u, vt, angle))) / (2 * step)
-        ahead, behind = _compose(u, vt @ turn.T, angle), _compose(u, vt @ turn, angle)
-        jacobian[:, 3 + k] = (value(ahead) - value(behind)) / (2 * step)
-    ahead, behind = _compose(u, vt, angle + step), _compose(u, vt, angle - step)
-    jacobian[:, 6] = (value(ahead) - value(behind)) / (2 * step)
-    return value(_compose(u, vt, angle)), jacobian
