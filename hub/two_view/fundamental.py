@@ -7,7 +7,6 @@ step; convention ``m_aᵀ F m_b = 0`` (asynchronous calibration paper, eq. 5).
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from protocols.core.errors import Refused
 from protocols.geometry import so3
@@ -45,6 +44,8 @@ def maximum_likelihood_fundamental(a: Floats, b: Floats, start: Floats | None = 
 
     start: (3, 3); default the eight-point solution. Raises Refused for fewer than 8 pairs.
     """
+    from scipy.optimize import least_squares  # slow to import, and needed by the papers' methods only
+
     first = eight_point(a, b) if start is None else start
     # In normalised coordinates, with the ratio of scales kept so that the Sampson distance is in pixels of one size.
     ta, tb = hartley_normalisation(a), hartley_normalisation(b)
