@@ -55,6 +55,24 @@ def hang(job: SolverJob) -> SolverAnswer:
     return SolverAnswer(job.number)
 
 
+def spin(job: SolverJob) -> SolverAnswer:
+    """A solver that computes for a minute."""
+    until = time.process_time() + 60.0
+    while time.process_time() < until:
+        pass
+    return SolverAnswer(job.number)
+
+
+def starve(job: SolverJob) -> SolverAnswer:
+    """A solver that is given little of a busy machine."""
+    for _ in range(25):
+        until = time.process_time() + 0.02
+        while time.process_time() < until:
+            pass
+        time.sleep(0.2)
+    return SolverAnswer(job.number, reason="starved")
+
+
 def die(job: SolverJob) -> SolverAnswer:
     """A solver whose process is killed."""
     os.kill(os.getpid(), signal.SIGKILL)
@@ -73,7 +91,7 @@ def test_its_answer_equals_an_inline_one(solver: WorkerSolver, job: SolverJob) -
         np.testing.assert_array_equal(camera.pose.rotation, inline.cameras[name].pose.rotation)
 
 
-@pytest.mark.parametrize("fault", [hang, die])
+@pytest.mark.parametrize("fault", [hang, spin, die])
 def test_a_solver_that_hangs_or_dies_is_replaced(
     solver: WorkerSolver, job: SolverJob, fault: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -89,6 +107,18 @@ def test_a_solver_that_hangs_or_dies_is_replaced(
     solver.submit(job, time.monotonic())
     assert answer_of(solver).calibration is not None
     assert solver.restarts == 1
+
+
+def test_a_solver_on_a_busy_machine_has_time_to_answer(
+    solver: WorkerSolver, job: SolverJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solver.submit(job, time.monotonic())
+    assert answer_of(solver).calibration is not None
+    solver._budget_s = 2.0
+    monkeypatch.setattr(worker, "run_job", starve)
+    solver.submit(job, time.monotonic())
+    assert answer_of(solver).reason == "starved"
+    assert solver.restarts == 0
 
 
 @pytest.mark.parametrize("fault", [hang, die])
