@@ -78,7 +78,7 @@ class WorkerSolver:
 
     def _cpu_s(self) -> float:
         """CPU [s] of the worker so far; 0 while it starts and where it cannot be told: then wall time decides."""
-        with suppress(Exception):  # another system, or a worker that has died
+        with suppress(AttributeError, OSError, BrokenProcessPool):  # another system, or a worker that has died
             if self._pid is not None and self._pid.done():
                 return time.clock_gettime((~self._pid.result() << 3) | 2)  # Linux' number of that clock
         return 0.0
