@@ -16,8 +16,8 @@ from deploy.site.fleet import read_state, stop_fleet
 from deploy.site.rig_folder import find_rig, read_rig_folder
 
 SECONDS = {"webcams-room": 15, "drone-cage": 20, "oak-array": 25, "companion": 15}
-PATIENCE_S = 420.0
-"""On a machine that does other things too, cameras give fewer frames, and a calibration of all of them needs longer."""
+PATIENCE_S = 900.0
+"""On a slow or busy machine cameras give fewer frames, and a calibration of all needs longer: 315 s were seen."""
 
 
 @pytest.mark.parametrize("name", sorted(SECONDS))
