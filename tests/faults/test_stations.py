@@ -7,6 +7,7 @@ skipped.
 from __future__ import annotations
 
 import asyncio
+import itertools
 import os
 import socket
 import subprocess
@@ -111,8 +112,9 @@ def test_an_application_with_mavsdk_finds_the_camera_and_selects(
         camera_on(f"udpout:127.0.0.1:{mavlink_port}") as camera,
         process(str(server), "-p", str(port), f"udpout://127.0.0.1:{mavlink_port}", folder=tmp_path),
     ):
-        asyncio.run(asyncio.wait_for(dialogue(client, port), 60.0))
-    rectangle, point, _ = camera.commands
+        asyncio.run(asyncio.wait_for(dialogue(client, port), 180.0))
+    # A station repeats a command whose acknowledgement is late.
+    rectangle, point, _ = [command for command, _ in itertools.groupby(camera.commands)]
     assert isinstance(rectangle, SelectTarget)
     assert (rectangle.left, rectangle.top, rectangle.right, rectangle.bottom) == pytest.approx((0.1, 0.2, 0.3, 0.4))
     assert isinstance(point, SelectTarget)
@@ -157,7 +159,7 @@ def test_behind_mavproxy_the_camera_is_seen_only_if_it_is_on_the_autopilot(tmp_p
             process(*proxy, folder=tmp_path),
             camera_on(f"udpout:127.0.0.1:{port if routed else for_camera}") as camera,
         ):
-            heard = hears_camera(for_station, 15.0 if routed else 3.0)
+            heard = hears_camera(for_station, 60.0 if routed else 3.0)
     assert heard == routed
     assert bool(camera.commands) == routed
     step = f"camera on the {camera_at}, station at an output: heartbeat, CAMERA_TRACK_RECTANGLE"
