@@ -112,8 +112,8 @@ def test_an_application_with_mavsdk_finds_the_camera_and_selects(
         camera_on(f"udpout:127.0.0.1:{mavlink_port}") as camera,
         process(str(server), "-p", str(port), f"udpout://127.0.0.1:{mavlink_port}", folder=tmp_path),
     ):
-        asyncio.run(asyncio.wait_for(dialogue(client, port), 180.0))
-    # A station repeats a command whose acknowledgement is late.
+        asyncio.run(asyncio.wait_for(dialogue(client, port), 60.0))
+    # A station repeats a command whose acknowledgement is late (by 0.8 s: once).
     rectangle, point, _ = [command for command, _ in itertools.groupby(camera.commands)]
     assert isinstance(rectangle, SelectTarget)
     assert (rectangle.left, rectangle.top, rectangle.right, rectangle.bottom) == pytest.approx((0.1, 0.2, 0.3, 0.4))
