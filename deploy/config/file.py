@@ -11,7 +11,7 @@ from typing import Any, TypeVar, get_args
 import msgspec
 
 from protocols.core.errors import InputError
-from protocols.core.files import parse_toml, read_toml
+from protocols.core.files import parse_toml, read_toml, toml_line
 
 _Config = TypeVar("_Config", bound=msgspec.Struct)
 
@@ -160,18 +160,7 @@ def _type_of(kind: type[msgspec.Struct], path: str) -> Any:
 
 
 def _line(text: str, path: str) -> int | None:
-    """The line number of a dotted key, by a line-by-line scan; None if it is not found."""
+    """The line number of a dotted key, or of its table; None if it is not found."""
     path = re.sub(r"\[[^\]]*\]", "", path)
-    if not path:
-        return None
     table, _, key = path.rpartition(".")
-    current = ""
-    for number, row in enumerate(text.splitlines(), 1):
-        header = re.match(r"\s*\[+\s*([^\]]*?)\s*\]+", row)
-        if header:
-            current = header[1]
-            if current == path:
-                return number
-        elif current == table and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*[=.]", row):
-            return number
-    return None
+    return toml_line(text, path) or toml_line(text, table, key or None)

@@ -88,6 +88,26 @@ def parse_toml(text: str, file: Path) -> dict[str, Any]:
         raise InputError(f"not valid TOML: {short}", file=file, line=line, remedy="correct this line") from None
 
 
+def toml_line(text: str, table: str, key: str | None = None) -> int | None:
+    """The line of a key in a table of a TOML text, as far as a plain scan finds it; otherwise that of the header.
+
+    table: dotted name, "" = before the first header.
+    """
+    found, inside, depth = None, not table, 0
+    header = re.compile(r"\s*\[+\s*[\"']?" + re.escape(table) + r"[\"']?\s*\]+")
+    for number, row in enumerate(text.splitlines(), 1):
+        within_list, depth = depth > 0, max(0, depth + row.count("[") - row.count("]"))
+        if within_list:
+            continue
+        if header.match(row):
+            inside, found = True, number
+        elif inside and row.lstrip().startswith("[") and "=" not in row:
+            return found
+        elif inside and key is not None and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*[=.]", row):
+            return number
+    return found
+
+
 def _check_integers(values: object) -> None:
     """Raise OverflowError for an integer of more than 64 bits, which no TOML file has and Python may not print."""
     rest = [values]

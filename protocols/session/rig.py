@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from protocols.core.errors import InputError
-from protocols.core.files import read_toml
+from protocols.core.files import read_toml, toml_line
 from protocols.core.names import check_name, is_name
 from protocols.core.ranges import (
     MAX_DISTORTION,
@@ -111,20 +111,7 @@ class _Table:
 
     def line(self, key: str | None = None) -> int | None:
         """The line of the table's header, or of ``key`` in it, as far as a plain text scan finds it."""
-        found: int | None = None
-        header = re.compile(r"\s*\[\s*[\"']?" + re.escape(self.where) + r"[\"']?\s*\]")
-        inside, depth = False, 0
-        for number, row in enumerate(self.text.splitlines(), 1):
-            within_list, depth = depth > 0, max(0, depth + row.count("[") - row.count("]"))
-            if within_list:
-                continue
-            if header.match(row):
-                inside, found = True, number
-            elif inside and row.lstrip().startswith("[") and "=" not in row:
-                return found
-            elif inside and key is not None and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*[=.]", row):
-                return number
-        return found
+        return toml_line(self.text, self.where, key)
 
     def fail(self, key: str | None, what: str, remedy: str) -> InputError:
         return InputError(f"[{self.where}] {what}", file=self.file, line=self.line(key), remedy=remedy)
