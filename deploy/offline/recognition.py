@@ -59,7 +59,7 @@ class Target:
     def text(self) -> str:
         """The target in words."""
         if self.board is None:
-            return {"marker": "marker", "bright": "light"}.get(self.kind, self.kind)
+            return {"marker": "ball", "bright": "light"}.get(self.kind, self.kind)
         return "tag" if self.board.tags and self.board.squares is None else "board"
 
 
@@ -139,7 +139,7 @@ def _look(looks: _Looks, board: Board | None, model: MarkerModel) -> Target:
 def _nothing(tried: list[str]) -> Refused:
     return Refused(
         f"nothing that moves was found in at least {_LEAST_VIDEOS} videos; tried: {', '.join(tried)}; name it with "
-        "--detector, describe a board in board.toml, or teach a marker with `syncline detect marker --teach`"
+        "--detector, describe a board in board.toml, or teach a ball's colour with `syncline detect marker --teach`"
     )
 
 

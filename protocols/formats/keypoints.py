@@ -131,6 +131,8 @@ def read(kind: str, paths: list[Path], camera: str | None) -> list[CameraKeypoin
             out.append(CameraKeypoints(_name(path, camera), path, list(reader(path)), kind == "mediapipe"))
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, OSError) as error:
             what = f"this is no {kind} file as we know it ({type(error).__name__}: {str(error)[:80]})"
+            if isinstance(error, KeyError):
+                what = f"looks like a file of {kind}, but key {error.args[0]} is missing"
             raise InputError(what, file=path, remedy="export it again, or name its format with --format") from None
     twice = next((one for i, one in enumerate(out) if one.camera in {o.camera for o in out[:i]}), None)
     if twice is not None:

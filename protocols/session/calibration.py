@@ -13,7 +13,7 @@ import tomli_w
 from protocols.core.acceptance import AcceptanceTest
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
-from protocols.core.files import read_toml, write_atomically
+from protocols.core.files import read_toml
 from protocols.core.pair_report import PairReport
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
@@ -198,16 +198,6 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
 def calibration_text(calibration: Calibration, rig: Rig) -> str:
     """The text of calibration.toml, which aniposelib loads unchanged."""
     return tomli_w.dumps(_plain(calibration_tables(calibration, rig)))
-
-
-def write_calibration(file: Path, calibration: Calibration, rig: Rig) -> None:
-    """Write calibration.toml."""
-    write_atomically(file, calibration_text(calibration, rig))
-
-
-def write_trajectory(file: Path, calibration: Calibration) -> None:
-    """Write trajectory.csv."""
-    write_atomically(file, trajectory_text(calibration))
 
 
 def trajectory_text(calibration: Calibration) -> str:

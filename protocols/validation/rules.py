@@ -252,6 +252,7 @@ def _camera_info(message: pb.CameraInfo) -> None:
     _intrinsics(message)
     _text(message.driver, "driver", MAX_LABEL)
     _text(message.clock, "clock", MAX_LABEL)
+    _text(message.target, "target", MAX_LABEL)
     _bounded(message.position, "position", (0, 3), MAX_LENGTH)
     _bounded(message.rotation, "rotation", (0, 3), MAX_TURN)
     _stds(message.position_std, "position_std", (0, 3), MAX_LENGTH)

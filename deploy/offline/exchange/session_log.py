@@ -179,6 +179,7 @@ def camera_info(rig: Rig, name: str) -> pb.CameraInfo:
 
     camera = rig.cameras[name]
     info = pb.CameraInfo(schema_version=1, camera=name, boot_id="import", driver="import", clock="device")
+    info.target = str(rig.metadata.get("target", ""))
     info.width, info.height, info.fps = camera.size[0], camera.size[1], camera.fps
     if camera.intrinsics is not None:
         info.matrix.extend(camera.intrinsics.matrix.ravel().tolist())
