@@ -17,6 +17,7 @@ Corners = tuple[Ints, Floats]
 NOTHING: Corners = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
 _SUBPIX_LEAST, _SUBPIX_MOST = 2, 9  # px: half window
 _SUBPIX_SHARE, _SUBPIX_SHARE_OF_TAGS = 0.4, 0.12  # of the distance of neighbouring corners; tags are in between
+_LEAST_CUT = 3  # rows and columns of corners of a part of a chessboard, OpenCV's least
 _MOST_CHANGE = 0.4  # of the step between corners to the next: a board seen from 5 squares away, tilted by 60 degrees
 
 
@@ -33,8 +34,11 @@ class Finder:
         self._charuco = _charuco_detector(board) if board.kind == "charuco" else None
         self._tags = _tag_detector(board) if board.tags else None
 
-    def find(self, grey: Grey, *, thorough: bool = False) -> Corners:
-        """The corners in an image (H, W) uint8. thorough: search a chessboard by every method."""
+    def find(self, grey: Grey, *, thorough: bool = False, cut: bool = False) -> Corners:
+        """The corners in an image (H, W) uint8.
+
+        thorough: search a chessboard by every method. cut: it may go on beyond the image's border.
+        """
         if min(grey.shape) < 24:
             return NOTHING
         print_ = np.asarray(255 - grey if self.board.inverted else grey, dtype=np.uint8)
@@ -46,6 +50,8 @@ class Finder:
             numbers, pixels = self._find_tags(print_)
         else:
             numbers, pixels = self._find_chessboard(print_, thorough)
+            if cut and not len(numbers) and not self.board.symmetric:
+                numbers, pixels = self._find_cut_chessboard(print_)
         if self.board.mirrored:
             pixels = np.column_stack([grey.shape[1] - 1.0 - pixels[:, 0], pixels[:, 1]])
             numbers = self._mirrored(numbers)
@@ -123,6 +129,42 @@ class Finder:
                 return numbers, _ordered(grey, pixels).reshape(-1, 2)
         return NOTHING
 
+    def _find_cut_chessboard(self, grey: Grey) -> Corners:
+        """The corners of a chessboard whose other columns, or rows, are beyond the image's border.
+
+        Which part of the board it is follows from the end inside the image: there one more column of squares follows
+        the last corners, and then the margin; and from the colours, which differ at the board's two ends.
+        """
+        assert self.board.squares is not None
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+        found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (_LEAST_CUT, _LEAST_CUT), flags=flags)
+        if not found or corners is None:
+            return NOTHING
+        shape = np.asarray(meta).shape[:2]
+        count = np.arange(shape[0] * shape[1])
+        _, refined = self.refine(grey, (count, np.asarray(corners, dtype=np.float64).reshape(-1, 2)))
+        found_part = refined.reshape(*shape, 2)
+        across, down = found_part[0, -1] - found_part[0, 0], found_part[-1, 0] - found_part[0, 0]
+        if across[0] * down[1] - across[1] * down[0] < 0.0:
+            found_part = found_part[:, ::-1]
+        columns, rows = self.board.squares[0] - 1, self.board.squares[1] - 1
+        all_numbers = np.arange(rows * columns).reshape(rows, columns)
+        for turn in range(4):
+            part = np.rot90(found_part, turn)
+            by_columns = part.shape[0] == rows and part.shape[1] < columns
+            if not by_columns and not (part.shape[1] == columns and part.shape[0] < rows):
+                continue
+            line = part if by_columns else part.transpose(1, 0, 2)  # across the board, from the end in the image
+            first, other = _diagonal_levels(grey, part)
+            if first <= other and _is_regular(part) and _ends(grey, line):
+                seen = all_numbers[:, : part.shape[1]] if by_columns else all_numbers[: part.shape[0]]
+                return seen.ravel(), part.reshape(-1, 2)
+            shift = columns - part.shape[1] if by_columns else rows - part.shape[0]
+            if (first <= other) == (shift % 2 == 0) and _is_regular(part) and _ends(grey, line[:, ::-1]):
+                seen = all_numbers[:, shift:] if by_columns else all_numbers[shift:]
+                return seen.ravel(), part.reshape(-1, 2)
+        return NOTHING
+
     def _mirrored(self, numbers: Ints) -> Ints:
         """The places on the sheet of a mirrored print's corners: its columns are exchanged."""
         if self.board.squares is None or not len(numbers):
@@ -146,6 +188,29 @@ def _is_regular(corners: Floats) -> bool:
         if (change > _MOST_CHANGE * 0.5 * np.linalg.norm(line[2:] - line[:-2], axis=2)).any():
             return False
     return True
+
+
+def _ends(grey: Grey, corners: Floats) -> bool:
+    """Whether a board ends inside the image before the first column of corners (rows, columns, 2), and not at the last.
+
+    Half a step before the first corners are the last squares, dark and light; from one step on, the margin.
+    """
+    size = [grey.shape[1], grey.shape[0]]
+    step, beyond = corners[:, 0] - corners[:, 1], 2.0 * corners[:, -1] - corners[:, -2]
+    middle, half = 0.5 * (corners[:-1, 0] + corners[1:, 0]), 0.5 * (step[:-1] + step[1:])
+    inner, last, margin = (middle + far * half for far in (-0.5, 0.5, 1.25))
+    if (margin < 0.0).any() or (margin > np.subtract(size, 1)).any():
+        return False
+    if not ((beyond < 0.0) | (beyond > np.subtract(size, 1))).any():
+        return False
+
+    def contrast(points: Floats) -> float:
+        places = np.rint(points).astype(int)
+        levels = grey[places[:, 1], places[:, 0]].astype(np.float64)
+        return float(levels[::2].mean() - levels[1::2].mean())
+
+    usual = contrast(inner)
+    return -contrast(last) * np.sign(usual) > 0.5 * abs(usual) and abs(contrast(margin)) < 0.25 * abs(usual)
 
 
 def _ordered(grey: Grey, corners: Floats) -> Floats:
