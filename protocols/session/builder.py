@@ -383,7 +383,7 @@ class SessionBuilder:
         info = self._rig
         cameras = {name: rig_camera_from_info(self._cameras[name]) for name in order}
         sought = {self._cameras[name].target for name in order}
-        metadata: dict[str, Any] = {"target": one for one in sought if one and len(sought) == 1}
+        metadata: dict[str, Any] = {"target": min(sought)} if len(sought) == 1 and any(sought) else {}
         if info is None:
             return Rig(cameras, metadata=metadata)
         inside = [d for d in info.distances if d.camera_a in cameras and d.camera_b in cameras]

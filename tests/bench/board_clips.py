@@ -63,11 +63,11 @@ def main() -> int:
 
 def cut() -> int:
     """Boards of 9x6 squares, 48 views of each case, seeds that no test has."""
-    detector = BoardDetector(parse_board({"board": "chessboard", "squares": "9x6", "inverted": False}))
+    board = parse_board({"board": "chessboard", "squares": "9x6", "inverted": False})
     for hidden in (1, 2, 3, 4):
         found, off = 0, [0.0]
         for image, truth in cut_chessboards((9, 6), 48, hidden, seed=700 + hidden):
-            numbers, pixels = detector.find(image)
+            numbers, pixels = BoardDetector(board).find(image)
             found += len(numbers) > 0
             off += np.linalg.norm(pixels - truth[numbers], axis=1).tolist()
         worst, rms = max(off), float(np.sqrt(np.mean(np.square(off))))

@@ -141,28 +141,23 @@ class Finder:
         if not found or corners is None:
             return NOTHING
         shape = np.asarray(meta).shape[:2]
-        count = np.arange(shape[0] * shape[1])
-        _, refined = self.refine(grey, (count, np.asarray(corners, dtype=np.float64).reshape(-1, 2)))
-        found_part = refined.reshape(*shape, 2)
-        across, down = found_part[0, -1] - found_part[0, 0], found_part[-1, 0] - found_part[0, 0]
-        if across[0] * down[1] - across[1] * down[0] < 0.0:
-            found_part = found_part[:, ::-1]
+        numbers = np.arange(shape[0] * shape[1])
+        _, refined = self.refine(grey, (numbers, np.asarray(corners, dtype=np.float64).reshape(-1, 2)))
+        grid = _right_handed(refined.reshape(*shape, 2))
         columns, rows = self.board.squares[0] - 1, self.board.squares[1] - 1
-        all_numbers = np.arange(rows * columns).reshape(rows, columns)
-        for turn in range(4):
-            part = np.rot90(found_part, turn)
-            by_columns = part.shape[0] == rows and part.shape[1] < columns
-            if not by_columns and not (part.shape[1] == columns and part.shape[0] < rows):
+        whole = np.arange(rows * columns).reshape(rows, columns)
+        for turn in range(4 if _is_regular(grid) else 0):
+            part = np.rot90(grid, turn)
+            hidden = rows - part.shape[0], columns - part.shape[1]
+            if min(hidden) != 0 or max(hidden) == 0:
                 continue
-            line = part if by_columns else part.transpose(1, 0, 2)  # across the board, from the end in the image
+            axis = int(hidden[1] > 0)
+            lines, of_board = np.moveaxis(part, axis, 0), np.moveaxis(whole, axis, 0)
             first, other = _diagonal_levels(grey, part)
-            if first <= other and _is_regular(part) and _ends(grey, line):
-                seen = all_numbers[:, : part.shape[1]] if by_columns else all_numbers[: part.shape[0]]
-                return seen.ravel(), part.reshape(-1, 2)
-            shift = columns - part.shape[1] if by_columns else rows - part.shape[0]
-            if (first <= other) == (shift % 2 == 0) and _is_regular(part) and _ends(grey, line[:, ::-1]):
-                seen = all_numbers[:, shift:] if by_columns else all_numbers[shift:]
-                return seen.ravel(), part.reshape(-1, 2)
+            for shift in (0, max(hidden)):
+                if (first <= other) == (shift % 2 == 0) and _ends(grey, lines[::-1] if shift else lines):
+                    seen = of_board[shift : shift + len(lines)]
+                    return np.moveaxis(seen, 0, axis).ravel(), part.reshape(-1, 2)
         return NOTHING
 
     def _mirrored(self, numbers: Ints) -> Ints:
@@ -190,27 +185,27 @@ def _is_regular(corners: Floats) -> bool:
     return True
 
 
-def _ends(grey: Grey, corners: Floats) -> bool:
-    """Whether a board ends inside the image before the first column of corners (rows, columns, 2), and not at the last.
+def _ends(grey: Grey, lines: Floats) -> bool:
+    """Whether a board ends inside the image before the first of lines (n, m, 2) of corners, and not after the last.
 
     Half a step before the first corners are the last squares, dark and light; from one step on, the margin.
     """
-    size = [grey.shape[1], grey.shape[0]]
-    step, beyond = corners[:, 0] - corners[:, 1], 2.0 * corners[:, -1] - corners[:, -2]
-    middle, half = 0.5 * (corners[:-1, 0] + corners[1:, 0]), 0.5 * (step[:-1] + step[1:])
-    inner, last, margin = (middle + far * half for far in (-0.5, 0.5, 1.25))
-    if (margin < 0.0).any() or (margin > np.subtract(size, 1)).any():
+    most = np.subtract(grey.shape[::-1], 1)
+    step, beyond = lines[0] - lines[1], 2.0 * lines[-1] - lines[-2]
+    middle, half = 0.5 * (lines[0, :-1] + lines[0, 1:]), 0.5 * (step[:-1] + step[1:])
+    places = [np.rint(middle + far * half).astype(int) for far in (-0.5, 0.5, 1.25)]
+    outside = [((one < 0) | (one > most)).any() for one in (places[2], beyond)]
+    if outside != [False, True]:
         return False
-    if not ((beyond < 0.0) | (beyond > np.subtract(size, 1))).any():
-        return False
+    levels = [grey[one[:, 1], one[:, 0]].astype(np.float64) for one in places]
+    inner, last, margin = (float(one[::2].mean() - one[1::2].mean()) for one in levels)
+    return -last * np.sign(inner) > 0.5 * abs(inner) and abs(margin) < 0.25 * abs(inner)
 
-    def contrast(points: Floats) -> float:
-        places = np.rint(points).astype(int)
-        levels = grey[places[:, 1], places[:, 0]].astype(np.float64)
-        return float(levels[::2].mean() - levels[1::2].mean())
 
-    usual = contrast(inner)
-    return -contrast(last) * np.sign(usual) > 0.5 * abs(usual) and abs(contrast(margin)) < 0.25 * abs(usual)
+def _right_handed(corners: Floats) -> Floats:
+    """Corners (rows, columns, 2) in an order in which rows x columns is a right-handed frame in the image."""
+    across, down = corners[0, -1] - corners[0, 0], corners[-1, 0] - corners[0, 0]
+    return corners[:, ::-1] if across[0] * down[1] - across[1] * down[0] < 0.0 else corners
 
 
 def _ordered(grey: Grey, corners: Floats) -> Floats:
@@ -220,10 +215,7 @@ def _ordered(grey: Grey, corners: Floats) -> Floats:
     Other boards do not: the first corner is then the one further up and left in the image.
     """
     rows, columns = corners.shape[:2]
-    # The pattern may be found in a mirrored order: rows x columns must form a right-handed frame in the image.
-    across, down = corners[0, -1] - corners[0, 0], corners[-1, 0] - corners[0, 0]
-    if across[0] * down[1] - across[1] * down[0] < 0.0:
-        corners = corners[:, ::-1]
+    corners = _right_handed(corners)  # finders may give a mirrored order
     if (rows + columns) % 2:
         first, other = _diagonal_levels(grey, corners)
         return corners if first <= other else corners[::-1, ::-1]
