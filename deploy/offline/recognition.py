@@ -15,7 +15,7 @@ import numpy.typing as npt
 from edge.detectors.base import Detector
 from edge.detectors.board.description import BOARD_FILE, Board, BoardKind, load_dictionary, read_board
 from edge.detectors.board.detector import SEARCH_PX, BoardDetector
-from edge.detectors.board.finder import Finder
+from edge.detectors.board.finder import Finder, chessboard_of_any_size
 from edge.detectors.board.saddles import linked_saddles
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
@@ -243,10 +243,9 @@ class _Looks:
             for image in map(_small, map(_grey, self.images(path))):
                 if not linked_saddles(image, 8):
                     continue
-                flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
-                found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (4, 4), flags)
-                if found and meta is not None and corners is not None:
-                    rows, columns = np.asarray(meta).shape[:2]
+                corners = chessboard_of_any_size(image, 4)
+                if corners is not None:
+                    rows, columns = corners.shape[:2]
                     sizes[max(rows, columns) + 1, min(rows, columns) + 1] += 1
         if not sizes:
             return None

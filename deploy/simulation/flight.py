@@ -78,13 +78,10 @@ def _write_video(world: FlightWorld, out: Path) -> Path:
 
 
 def _rig(world: FlightWorld) -> dict[str, Any]:
-    width, height = world.size
     table = {
         "name": _CAMERA,
-        "size": [width, height],
         "fps": world.fps,
-        "matrix": world.lens.matrix.tolist(),
-        "distortions": world.lens.distortions.tolist(),
+        **world.lens.table(),
         "body_from_camera": world.body_from_camera.tolist(),
     }
     return {_CAMERA: table, "metadata": {"name": f"{TOWN}:{world.name}", "units": "m"}}

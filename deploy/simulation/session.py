@@ -76,14 +76,7 @@ def camera_tables(scene: SimulatedScene, name: str) -> tuple[dict[str, Any], dic
     rig: dict[str, Any] = {"metadata": metadata}
     truth: dict[str, Any] = {"metadata": {**metadata, "reference": reference, "scale": "metric"}}
     for camera in scene.cameras:
-        lens = camera.intrinsics
-        rig[camera.name] = {
-            "name": camera.name,
-            "size": [lens.width, lens.height],
-            "fps": camera.fps,
-            "matrix": lens.matrix.tolist(),
-            "distortions": lens.distortions.tolist(),
-        }
+        rig[camera.name] = {"name": camera.name, "fps": camera.fps, **camera.intrinsics.table()}
         time_map = scene.true_time_map(camera.name, reference)
         truth[camera.name] = {
             **rig[camera.name],

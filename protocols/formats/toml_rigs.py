@@ -152,13 +152,11 @@ def _table(project: str, number: int, camera: CameraCalibration) -> dict[str, An
     lens, pose = camera.intrinsics, camera.pose
     table: dict[str, Any] = {
         "name": camera.name,
-        "size": [lens.width, lens.height],
-        "matrix": lens.matrix.tolist(),
-        "distortions": lens.distortions.tolist(),
+        **lens.table(),
         "rotation": pose.rodrigues.tolist(),
         "translation": pose.translation.tolist(),
     }
-    if lens.fisheye or project in ("pose2sim", "caliscope"):
+    if project in ("pose2sim", "caliscope"):
         table["fisheye"] = lens.fisheye
     if project == "caliscope":
         table |= {"cam_id": number, "rotation_count": 0, "error": camera.rms_px, "grid_count": 0}

@@ -161,7 +161,6 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
         "version": calibration.version,
     }
     for name, camera in calibration.cameras.items():
-        lens = camera.intrinsics
         table = dict(rig.cameras[name].table) if name in rig.cameras else {}
         # A surveyed position is an input: the estimate is the translation, and two values that differ by the
         # survey's error would contradict each other.
@@ -169,9 +168,7 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
             table.pop(key, None)
         table |= {
             "name": name,
-            "size": [lens.width, lens.height],
-            "matrix": lens.matrix.tolist(),
-            "distortions": lens.distortions.tolist(),
+            **camera.intrinsics.table(),
             "rotation": camera.pose.rodrigues.tolist(),
             "translation": camera.pose.translation.tolist(),
             "time_offset": camera.time_map.time_offset,
@@ -180,8 +177,6 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
             "position_std": camera.position_std.tolist(),
             "rms_px": camera.rms_px,
         }
-        if lens.fisheye:
-            table["fisheye"] = True
         if camera.focal_std > 0.0:
             table["focal_std"] = camera.focal_std
         if camera.readout != 0.0:

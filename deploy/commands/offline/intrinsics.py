@@ -109,14 +109,7 @@ def intrinsics(
         lens = fit.intrinsics
         if fit.views < MIN_VIEWS:
             guess_std = fit.focal_std
-    table: dict[str, Any] = {
-        "name": name,
-        "size": [lens.width, lens.height],
-        "matrix": lens.matrix.tolist(),
-        "distortions": lens.distortions.tolist(),
-    }
-    if lens.fisheye:
-        table["fisheye"] = True
+    table: dict[str, Any] = {"name": name, **lens.table()}
     if guess_std:
         table["focal_std"] = guess_std
     write_atomically(out, _completed(out, name, table))

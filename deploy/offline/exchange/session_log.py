@@ -161,8 +161,7 @@ def rig_tables_of_log(rig: Rig) -> dict[str, Any]:
             table["fps"] = camera.fps
         lens = camera.intrinsics
         if lens is not None:
-            table |= {"matrix": lens.matrix.tolist(), "distortions": lens.distortions.tolist()}
-            table |= {"fisheye": True} if lens.fisheye else {}
+            table |= lens.table()
         if camera.rotation is not None:
             table["rotation"] = so3.log(camera.rotation).tolist()
         for key in ("position", "position_std", "rotation_std"):

@@ -136,14 +136,11 @@ class Finder:
         the last corners, and then the margin; and from the colours, which differ at the board's two ends.
         """
         assert self.board.squares is not None
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-        found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (_LEAST_CUT, _LEAST_CUT), flags=flags)
-        if not found or corners is None:
+        raw = chessboard_of_any_size(grey, _LEAST_CUT)
+        if raw is None:
             return NOTHING
-        shape = np.asarray(meta).shape[:2]
-        numbers = np.arange(shape[0] * shape[1])
-        _, refined = self.refine(grey, (numbers, np.asarray(corners, dtype=np.float64).reshape(-1, 2)))
-        grid = _right_handed(refined.reshape(*shape, 2))
+        numbers = np.arange(raw.size // 2)
+        grid = _right_handed(self.refine(grey, (numbers, raw.reshape(-1, 2)))[1].reshape(raw.shape))
         columns, rows = self.board.squares[0] - 1, self.board.squares[1] - 1
         whole = np.arange(rows * columns).reshape(rows, columns)
         for turn in range(4 if _is_regular(grid) else 0):
@@ -171,6 +168,15 @@ class Finder:
             return np.asarray(4 * (row * columns + columns - 1 - column) + np.array([1, 0, 3, 2])[corner])
         row, column = np.divmod(numbers, columns - 1)
         return np.asarray(row * (columns - 1) + columns - 2 - column)
+
+
+def chessboard_of_any_size(grey: Grey, least: int) -> Floats | None:
+    """Corners (rows, columns, 2) of a chessboard with at least ``least`` of them each way; None = none is seen."""
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (least, least), flags=flags)
+    if not found or corners is None or meta is None:
+        return None
+    return np.asarray(corners, dtype=np.float64).reshape(*np.asarray(meta).shape[:2], 2)
 
 
 def _is_regular(corners: Floats) -> bool:
