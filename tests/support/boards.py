@@ -88,14 +88,14 @@ def cut_chessboards(
     """
     rng = np.random.default_rng(seed)
     columns, rows = squares
-    unit, shape = 40, (960, 720)
+    unit, shape = 27, (640, 480)
     y, x = np.mgrid[: rows * unit, : columns * unit] // unit
     sheet = np.pad(np.where((x + y) % 2, 225, 25).astype(np.uint8), unit, constant_values=225)
     if covered:
         sheet[:, : 4 * unit] = 127
     # Where squares meet are the edges of pixels, whose centres are whole numbers.
     corners = np.array([[i + 2, j + 2] for j in range(rows - 1) for i in range(columns - 1)]) * unit - 0.5
-    texture = cv2.GaussianBlur(rng.integers(0, 255, shape[::-1], dtype=np.uint8), (0, 0), 6).astype(np.float64)
+    texture = cv2.GaussianBlur(rng.integers(0, 255, shape[::-1], dtype=np.uint8), (0, 0), 5).astype(np.float64)
     background = np.clip((texture - 127) * 6 + 127, 0, 255).astype(np.uint8)
     size = np.array(sheet.shape[::-1], dtype=np.float64)
     square = np.array([[0, 0], [size[0], 0], size, [0, size[1]]])

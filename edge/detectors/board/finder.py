@@ -49,9 +49,11 @@ class Finder:
         elif self._tags is not None:
             numbers, pixels = self._find_tags(print_)
         else:
-            numbers, pixels = self._find_chessboard(print_, thorough)
+            numbers, pixels = self._find_chessboard(print_, False)
             if cut and not len(numbers) and not self.board.symmetric:
                 numbers, pixels = self._find_cut_chessboard(print_)
+            if thorough and not len(numbers):
+                numbers, pixels = self._find_chessboard(print_, True)
         if self.board.mirrored:
             pixels = np.column_stack([grey.shape[1] - 1.0 - pixels[:, 0], pixels[:, 1]])
             numbers = self._mirrored(numbers)
@@ -117,7 +119,7 @@ class Finder:
             (classic, cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK),
         ]
         if thorough:
-            methods.append((sector, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY))
+            methods = [(sector, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)]
         for method, flags in methods:
             found, corners = method(grey, inner, flags=flags)
             if not found or corners is None:
@@ -205,7 +207,9 @@ def _ends(grey: Grey, lines: Floats) -> bool:
         return False
     levels = [grey[one[:, 1], one[:, 0]].astype(np.float64) for one in places]
     inner, last, margin = (float(one[::2].mean() - one[1::2].mean()) for one in levels)
-    return -last * np.sign(inner) > 0.5 * abs(inner) and abs(margin) < 0.25 * abs(inner)
+    light = max(levels[1][::2].mean(), levels[1][1::2].mean()) - 0.25 * abs(inner)
+    is_margin = abs(margin) < 0.25 * abs(inner) and levels[2].mean() > light
+    return bool(is_margin and -last * np.sign(inner) > 0.5 * abs(inner))
 
 
 def _right_handed(corners: Floats) -> Floats:

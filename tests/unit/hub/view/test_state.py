@@ -82,7 +82,7 @@ def test_the_panel_shows_the_figures_of_the_hub() -> None:
     assert f"{found.rms_px:.2f} px" in text
     assert "25.0" in text
     assert "✓ cam0" in text
-    assert "50 frames, marker in 50" in camera_details(state, state.cameras["cam0"], now)
+    assert "50 frames, target in 50" in camera_details(state, state.cameras["cam0"], now)
 
 
 def test_names_and_reasons_cannot_put_markup_into_the_page() -> None:
