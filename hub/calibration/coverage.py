@@ -131,6 +131,12 @@ def target_of(rig: Rig, labels: list[str]) -> str:
     return "person" if any(label.endswith(("hip", "knee", "shoulder", "head", "foot")) for label in labels) else _ANY
 
 
+def in_words_of(text: str, rig: Rig, labels: list[str]) -> str:
+    """A text on "the point", which says what the user moves instead, where that is known."""
+    word = target_of(rig, labels)
+    return text if word == _ANY else text.replace("the point", f"the {word}").replace("The point", f"The {word}")
+
+
 def camera_advice(camera: str, frames: int, rows: int, covered: Bools, target: str = _ANY) -> CoverageAdvice | None:
     """Advice on one camera, None if none is needed. frames: received from it; rows: those with a detection.
 

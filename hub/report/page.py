@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
+from hub.calibration.coverage import in_words_of
 from hub.report import convergence, image_maps, measures, pair_graph, rig_figure, tables, time_figures
 from hub.report.convergence import OffsetStdSample
 from hub.report.measures import RowUsage
@@ -71,8 +72,10 @@ def build_report(
     stds of a live hub's calibrations over a log.
     """
     if isinstance(outcome, Refused):
-        return _refusal_page(outcome, rig, observations, command)
-    return _calibration_page(outcome, rig, observations, command, history)
+        page = _refusal_page(outcome, rig, observations, command)
+    else:
+        page = _calibration_page(outcome, rig, observations, command, history)
+    return in_words_of(page, rig, observations.labels)
 
 
 def _calibration_page(

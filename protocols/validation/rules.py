@@ -212,7 +212,7 @@ def _detection(detection: pb.Detection) -> None:
     if detection.covariance:
         _covariance_2d(detection.covariance, "covariance")
     if detection.kind:
-        _one_of(detection.kind, "kind", _KINDS)
+        _one_of(detection.kind, "kind", _KINDS | {"corner"})
     if detection.head:
         _vector(detection.head, "head", (2,), -MAX_PIXEL, MAX_PIXEL)
     if detection.foot:

@@ -121,6 +121,8 @@ def import_(
             rows, count, warnings = len(seen), session_log.session_to_log(rig, seen, out, arrivals), seen.warnings
             if rig.scale_bars:
                 warnings += ("a log does not store the scale bar: add it to the rig.toml of its export",)
+            if rig.bodies:
+                warnings += ("a log does not store the board: its corners are single points there",)
         noun = "detections" if objects else "observations"
         summary = f"{len(rig.cameras)} cameras, {rows} {noun}, {count} messages"
         cameras = list(rig.cameras)

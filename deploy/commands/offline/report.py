@@ -42,6 +42,7 @@ def report(
     """
     from deploy.offline.progress import progress_bar
     from deploy.offline.report_input import load_report_input
+    from hub.calibration.coverage import in_words_of
     from hub.report import build_report
     from hub.report.measures import row_usage
     from hub.report.quality_assessment import assess_quality, assess_refusal
@@ -66,13 +67,10 @@ def report(
             report_input.observations,
             row_usage(outcome, report_input.rig, report_input.observations),
         )
-    summary = {
-        "report": str(file),
-        "level": assessment.level,
-        "verdict": assessment.headline,
-        "todo": assessment.actions,
-    }
-    todo = [f"to do: {line}" for line in assessment.actions]
+    rig, labels = report_input.rig, report_input.observations.labels
+    todo = [in_words_of(line, rig, labels) for line in assessment.actions]
+    summary = {"report": str(file), "level": assessment.level, "verdict": assessment.headline, "todo": todo}
+    todo = [f"to do: {line}" for line in todo]
     answer(summary, [assessment.headline, *todo, *closing_lines((), [file])], json)
     if browser:
         open_browser(file.resolve().as_uri())

@@ -89,6 +89,8 @@ def _objects_file(folder: Path) -> Path | None:
     if not file.exists():
         boxes = folder / BOXES_FILE
         return boxes if boxes.exists() else None
+    if (folder / RIG_FILE).exists() and read_rig(folder / RIG_FILE).bodies:
+        return None  # corners of a board: labelled points
     objects = is_boxes_file(file) or not {"kind", "box_x", "head_u"}.isdisjoint(read_csv_header(file, "observations"))
     return file if objects else None
 
