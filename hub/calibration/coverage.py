@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from hub.report.measures import COLUMNS, ROWS, covered_cells
+from hub.report.wording import ANY, VERBS, target_of
 from protocols.geometry.types import Bools
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -24,16 +25,6 @@ MIN_COVERAGE = 0.35
 """Share of the image cells in which the target should have been seen."""
 MIN_DETECTIONS = 90
 """Detections below which a camera can hardly be calibrated with another."""
-_VERBS = {
-    "ball": "wave it",
-    "board": "show it",
-    "tag": "show it",
-    "light": "move it",
-    "person": "walk",
-    "vehicle": "drive",
-}
-"""What the user does with the target, by its name."""
-_ANY = "target"  # what the user moves, where nobody says what it is
 _MAX_ADVICE = 2  # pieces of advice at a time: people do not follow more
 _MAX_ADVISED = 64  # cameras that are considered: of a thousand it would take a second
 
@@ -68,7 +59,7 @@ class CoverageMonitor:
 
         if isinstance(message, pb.CameraInfo):
             self._sizes[message.camera] = (message.width, message.height)
-            self._targets[message.camera] = message.target or _ANY
+            self._targets[message.camera] = message.target or ANY
             self._counts.setdefault(message.camera, np.zeros((ROWS, COLUMNS), dtype=np.int64))
         elif isinstance(message, pb.Observation):
             name = message.camera
@@ -102,11 +93,11 @@ class CoverageMonitor:
     def target(self) -> str:
         """What the user moves, in one word: what most cameras look for."""
         sought = list(self._targets.values())
-        return max(sought, key=sought.count, default=_ANY)
+        return max(sought, key=sought.count, default=ANY)
 
     def instruction(self) -> str:
         """What to do with the target: "wave the ball", "walk about"."""
-        verb = _VERBS.get(self.target, "move it")
+        verb = VERBS.get(self.target, "move it")
         return verb.replace("it", f"the {self.target}") if verb.endswith(" it") else f"{verb} about"
 
     def advice(self, max_advice: int = _MAX_ADVICE) -> list[CoverageAdvice]:
@@ -114,35 +105,18 @@ class CoverageMonitor:
         cameras = sorted({*self._sizes, *self._frames})[:_MAX_ADVISED]
         frames, rows = self._frames.get, self._rows.get
         found = [
-            camera_advice(name, frames(name, 0), rows(name, 0), self.covered_cells(name), self._targets.get(name, _ANY))
+            camera_advice(name, frames(name, 0), rows(name, 0), self.covered_cells(name), self._targets.get(name, ANY))
             for name in cameras
         ]
         return _most_urgent([advice for advice in found if advice is not None], max_advice)
 
 
-def target_of(rig: Rig, labels: list[str]) -> str:
-    """What the user moves, in one word: as the session or the only label says, a board where there are bodies, a person
-    with joints."""
-    given = rig.metadata.get("target", labels[0] if len(labels) == 1 else None)
-    if isinstance(given, str) and given in _VERBS:
-        return given
-    if rig.bodies:
-        return "board" if max(len(body) for body in rig.bodies.values()) > 4 else "tag"
-    return "person" if any(label.endswith(("hip", "knee", "shoulder", "head", "foot")) for label in labels) else _ANY
-
-
-def in_words_of(text: str, rig: Rig, labels: list[str]) -> str:
-    """A text on "the point", which says what the user moves instead, where that is known."""
-    word = target_of(rig, labels)
-    return text if word == _ANY else text.replace("the point", f"the {word}").replace("The point", f"The {word}")
-
-
-def camera_advice(camera: str, frames: int, rows: int, covered: Bools, target: str = _ANY) -> CoverageAdvice | None:
+def camera_advice(camera: str, frames: int, rows: int, covered: Bools, target: str = ANY) -> CoverageAdvice | None:
     """Advice on one camera, None if none is needed. frames: received from it; rows: those with a detection.
 
     target: what the user moves, see `target_of`.
     """
-    do = _VERBS.get(target, "move it")
+    do = VERBS.get(target, "move it")
     share = float(covered.mean())
     regions = uncovered_regions(covered)
     if frames == 0:

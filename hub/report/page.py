@@ -5,7 +5,6 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
-from hub.calibration.coverage import in_words_of
 from hub.report import convergence, image_maps, measures, pair_graph, rig_figure, tables, time_figures
 from hub.report.convergence import OffsetStdSample
 from hub.report.measures import RowUsage
@@ -18,6 +17,7 @@ from hub.report.quality_assessment import (
 )
 from hub.report.style import STYLE
 from hub.report.svg import THIN, esc, number, short, whole
+from hub.report.wording import in_words_of
 from protocols.core.errors import Refused
 from protocols.core.version import VERSION
 from protocols.session.calibration import Calibration

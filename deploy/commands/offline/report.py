@@ -42,10 +42,10 @@ def report(
     """
     from deploy.offline.progress import progress_bar
     from deploy.offline.report_input import load_report_input
-    from hub.calibration.coverage import in_words_of
     from hub.report import build_report
     from hub.report.measures import row_usage
     from hub.report.quality_assessment import assess_quality, assess_refusal
+    from hub.report.wording import in_words_of
     from protocols.core.files import write_atomically
 
     file = out or (source / "report.html" if (source / "result.json").is_file() else Path("report.html"))

@@ -20,6 +20,7 @@ from deploy.cli import run
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
+from protocols.log.read.session import load_session
 from protocols.session.calibration import read_calibration
 from protocols.session.folder import read_folder
 from tests.support.videos import numbered_image, write_video
@@ -392,6 +393,23 @@ def test_a_session_becomes_a_log_and_a_session_again(tmp_path: Path) -> None:
         np.testing.assert_allclose(seen_again.tracks[key].time, track.time, rtol=0, atol=1e-9 + 1e-15 * track.time[0])
     assert run(["import", str(tmp_path / "s"), "--out", str(log)]) == 2  # a log is not replaced
     assert run(["export", str(log), "--out", str(again)]) == 2
+
+
+def test_the_corners_of_a_board_pass_through_a_log(tmp_path: Path, capsys: Capture) -> None:
+    session, log = tmp_path / "session", tmp_path / "log.mcap"
+    session.mkdir()
+    bodies = {"board": {str(k): [0.1 * (k % 3), 0.1 * (k // 3), 0.0] for k in range(6)}}
+    cameras = {name: {"name": name, "size": [640, 480], "fps": 10.0} for name in ("CVLab1", "GoPro 2")}
+    rig = {"metadata": {"units": "m", "target": "board", "bodies": bodies}, **cameras}
+    (session / "rig.toml").write_text(tomli_w.dumps(rig))
+    lines = [f"{c},{i},{i / 10},{9 * k + i},{7 * k},{k},corner" for c in cameras for i in range(4) for k in range(6)]
+    (session / "observations.csv").write_text("\n".join(["camera,frame,time,u,v,label,kind", *lines]) + "\n")
+    assert run(["import", str(session), "--out", str(log)]) == 0
+    assert "a log does not store the board" in capsys.readouterr().out
+    read = load_session(log)
+    assert len(read.observations) == len(lines)
+    assert read.rig.metadata["target"] == "board"
+    assert read.observations.cameras == list(cameras)
 
 
 def test_a_log_by_a_calibration_has_the_frames_as_they_happened(tmp_path: Path, capsys: Capture) -> None:
