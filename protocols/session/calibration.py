@@ -22,18 +22,9 @@ from protocols.geometry.types import Floats
 from protocols.session.rig import Rig, read_rig
 
 _REPLACED_METADATA = (
-    "distances",
-    "wand",
-    "bodies",
-    "bodies_scale",
-    "in_step",
-    "target",
-    "refused",
-    "scale",
-    "solver",
-    "version",
+    "distances", "wand", "bodies", "bodies_scale", "in_step", "target", "refused", "scale", "solver", "version",
     "reference",
-)
+)  # fmt: skip
 """Metadata keys of rig.toml that the result replaces."""
 
 
