@@ -67,9 +67,9 @@ class Finder:
         share = _SUBPIX_SHARE if self.board.kind == "chessboard" else _SUBPIX_SHARE_OF_TAGS
         half = int(np.clip(share * self.pitch(corners), _SUBPIX_LEAST, _SUBPIX_MOST))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
-        found = cv2.cornerSubPix(
-            grey, pixels.astype(np.float32).reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria
-        )
+        # Finders extrapolate grids to beyond the image, where OpenCV refuses to begin.
+        begin = np.clip(pixels, 0.0, np.subtract(grey.shape[::-1], 1)).astype(np.float32).reshape(-1, 1, 2)
+        found = cv2.cornerSubPix(grey, begin, (half, half), (-1, -1), criteria)
         refined = np.asarray(found, dtype=np.float64).reshape(-1, 2)
         moved = np.linalg.norm(refined - pixels, axis=1) < 1.5 * half
         return numbers, np.where(moved[:, None], refined, pixels)

@@ -46,3 +46,12 @@ def test_a_board_with_a_hidden_end_is_not_numbered() -> None:
     for image, truth in cut_chessboards((9, 6), 4, 2, seed=6, covered=True):
         numbers, pixels = Finder(board()).find(image, cut=True)
         assert np.linalg.norm(pixels - truth[numbers], axis=1).max(initial=0.0) < 0.5
+
+
+def test_corners_that_are_extrapolated_beyond_the_image_are_no_error() -> None:
+    image, truth = next(cut_chessboards((9, 6), 1, 3, seed=44))
+    numbers, pixels = Finder(board()).refine(image, (np.arange(len(truth)), truth))
+    assert (truth > np.subtract(image.shape[::-1], 1)).any()
+    inside = (truth > 0).all(axis=1) & (truth < np.subtract(image.shape[::-1], 20)).all(axis=1)
+    assert np.linalg.norm(pixels[inside] - truth[inside], axis=1).max() < 0.5
+    assert len(numbers) == len(truth)
