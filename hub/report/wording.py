@@ -31,4 +31,6 @@ def target_of(rig: Rig, labels: list[str]) -> str:
 def in_words_of(text: str, rig: Rig, labels: list[str]) -> str:
     """A text on "the point", which says what the user moves instead, where that is known."""
     word = target_of(rig, labels)
-    return text if word == ANY else text.replace("the point", f"the {word}").replace("The point", f"The {word}")
+    for article in ("the", "The", "this") if word != ANY else ():
+        text = text.replace(f"{article} point", f"{article} {word}")
+    return text

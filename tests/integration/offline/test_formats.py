@@ -17,6 +17,7 @@ import tomli_w
 import yaml
 
 from deploy.cli import run
+from protocols.core.names import key_segment
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
@@ -580,6 +581,9 @@ def named_results(named_session: Path) -> Path:
         ("replay log.mcap --through hub --calibration solved/calibration.toml --out OUT.mcap", None),
         ("replay log.mcap --compare log.mcap", None),
         ("info log.mcap", "printed"),
+        ("recover log.mcap --out OUT.mcap", None),
+        ("export solved/calibration.toml --to caliscope --session session --out OUT", "printed"),
+        ("intrinsics videos/Front-left.mp4 --field-of-view 70 --out OUT.toml", None),
         ("report solved --out OUT.html", "OUT.html"),
     ],
 )
@@ -596,6 +600,22 @@ def test_every_other_command_takes_cameras_as_users_name_them(
     if named_in is not None:
         text = printed if named_in == "printed" else (tmp_path / named_in).read_text(encoding="utf-8")
         assert [name for name in NAMED if name not in text] == []
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_agents_are_configured_and_installed_by_the_names_of_users(name: str, tmp_path: Path, capsys: Capture) -> None:
+    file = tmp_path / "agent.toml"
+    file.write_text(f'id = "{name}"\nsite = "yard"\n', encoding="utf-8")
+    assert run(["camera", str(file), "--print-config"]) == 0
+    assert f'id = "{name}"' in capsys.readouterr().out
+    hub = f'id = "hub of {name}"\nnodes = ["{name}"]\n'
+    file.write_text(hub, encoding="utf-8")
+    assert run(["hub", str(file), "--print-config"]) == 0
+    assert f'nodes = ["{name}"]' in capsys.readouterr().out.replace("\n", "").replace("    ", "").replace(",]", "]")
+    file.write_text(f'id = "{name}"\nsite = "yard"\n', encoding="utf-8")
+    assert run(["install", "camera", "--config", str(file), "--root", str(tmp_path), "--dry-run"]) == 0
+    service = f"camera-{key_segment(name).replace('%', '.')}"
+    assert f"/etc/systemd/system/syncline-{service}.service" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("bad", ["../up", "a/b", "cam?", ".hidden", "x" * 64])
