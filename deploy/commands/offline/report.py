@@ -70,8 +70,7 @@ def report(
     rig, labels = report_input.rig, report_input.observations.labels
     todo = [in_words_of(line, rig, labels) for line in assessment.actions]
     summary = {"report": str(file), "level": assessment.level, "verdict": assessment.headline, "todo": todo}
-    todo = [f"to do: {line}" for line in todo]
-    answer(summary, [assessment.headline, *todo, *closing_lines((), [file])], json)
+    answer(summary, [assessment.headline, *(f"to do: {line}" for line in todo), *closing_lines((), [file])], json)
     if browser:
         open_browser(file.resolve().as_uri())
     return EXIT_DONE
