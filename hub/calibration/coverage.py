@@ -59,7 +59,7 @@ class CoverageMonitor:
 
         if isinstance(message, pb.CameraInfo):
             self._sizes[message.camera] = (message.width, message.height)
-            self._targets[message.camera] = message.target or ANY
+            self._targets[message.camera] = message.target if message.target in VERBS else ANY
             self._counts.setdefault(message.camera, np.zeros((ROWS, COLUMNS), dtype=np.int64))
         elif isinstance(message, pb.Observation):
             name = message.camera

@@ -87,6 +87,9 @@ def test_the_panel_shows_the_figures_of_the_hub() -> None:
 
 def test_names_and_reasons_cannot_put_markup_into_the_page() -> None:
     state = ViewState()
+    info = camera_info("cam0")
+    info.target = "<img src=x onerror='alert(3)'>"
+    state.handle(info, 0.0)
     filming(state)
     bad = pb.Calibration(schema_version=1, status="refused", reason="<script>alert(1)</script>")
     bad.refused.append(pb.Refusal(camera="cam0", reason="<img src=x onerror='alert(2)'>\"'"))
