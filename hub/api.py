@@ -136,7 +136,7 @@ class TriangulationResult:
     """Trajectories of labelled points on the reference clock of a given calibration, in its world and units.
 
     sigma_px: noise of one pixel coordinate, by camera. unused: why a camera was not used, by name. unplaced: labels
-    without a trajectory.
+    without a trajectory. observations: of the calibrated cameras, each person under one name in all of them.
     """
 
     rig: Rig
@@ -145,6 +145,7 @@ class TriangulationResult:
     unused: dict[str, str]
     unplaced: tuple[str, ...]
     warnings: tuple[str, ...]
+    observations: Observations
 
     def save(self, file: str | Path) -> None:
         """Write time,x,y,z,std,label as CSV, floats with 17 significant digits. Raises InputError."""
@@ -184,7 +185,7 @@ def read_session(path: str | Path, observations: str | Path | None = None) -> Se
     try:
         rig, found, priors, warnings = session_from_messages(messages)
     except Refused as refusal:
-        remedy = "record cameras that see the marker, or people"
+        remedy = "record cameras that see what moves"
         raise InputError(f"no session in this log: {refusal.reason}", file=path, remedy=remedy) from None
     damage = (f"the log is damaged: {reader.damage}",) if reader.damage else ()
     return RecordedSession(rig, found, damage + warnings, path.stem, priors)
@@ -316,7 +317,7 @@ def triangulate(
     warnings = (*warnings, note) if note else warnings
     found = estimate_trajectories(rig, known, used, progress)
     return TriangulationResult(
-        rig, found.tables, found.sigma_px, found.unused, found.unplaced, (*warnings, *found.warnings)
+        rig, found.tables, found.sigma_px, found.unused, found.unplaced, (*warnings, *found.warnings), used
     )
 
 

@@ -75,26 +75,9 @@ UAV_INFO = Topic("uav_info", "uav/{id}/info", "UavInfo", 0.5, True, Delivery.LAT
 ROAD_MAP = Topic("road_map", "uav/{id}/road", "RoadMap", 2.0, True, Delivery.LATEST, 16, 0.0)
 
 TOPICS: tuple[Topic, ...] = (
-    OBSERVATION,
-    CAMERA_INFO,
-    RIG_INFO,
-    CALIBRATION,
-    TRACK,
-    TRACK_SMOOTHED,
-    SOLVER_EVENT,
-    STATUS,
-    NODE_STATE,
-    COMMAND,
-    PICTURE,
-    PREDICTION,
-    FLIGHT_IMAGE,
-    TELEMETRY,
-    TARGET_COMMAND,
-    TARGET,
-    TARGET_CLOUD,
-    ROAD_MAP,
-    UAV_INFO,
-)
+    OBSERVATION, CAMERA_INFO, RIG_INFO, CALIBRATION, TRACK, TRACK_SMOOTHED, SOLVER_EVENT, STATUS, NODE_STATE, COMMAND,
+    PICTURE, PREDICTION, FLIGHT_IMAGE, TELEMETRY, TARGET_COMMAND, TARGET, TARGET_CLOUD, ROAD_MAP, UAV_INFO,
+)  # fmt: skip
 TOPICS_BY_NAME: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
 
 

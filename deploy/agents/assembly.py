@@ -51,8 +51,16 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
         pictures_hz=config.pictures_hz,
         picture_width=config.picture_width,
         predictions=config.detector != "marker",
+        target=_target(config),
     ).run(stop)
     return EXIT_DONE
+
+
+def _target(config: CameraConfig) -> str:
+    """What the camera's detector looks for, in one word; "" for other packages' detectors."""
+    if config.detector == "marker":
+        return {"colour": "ball", "bright": "light", "tag": "tag"}[config.marker.mode]
+    return config.detector if config.detector in get_args(Kind) else ""
 
 
 def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Detector:

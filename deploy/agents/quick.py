@@ -113,7 +113,7 @@ class QuickCalibration:
         if view is not None:
             self._planes = ImagePlanes(view.server, self._on_click)
             with view.server.gui.add_folder("Your cameras", order=-1.0):
-                self._note = view.server.gui.add_markdown("Click on the marker in an image if it has no ring yet.")
+                self._note = view.server.gui.add_markdown("Click on the ball in an image if it has no ring yet.")
                 button = view.server.gui.add_button("Finish", color="green")
                 button.on_click(lambda event: self.finish.set())
 
@@ -176,7 +176,9 @@ class QuickCalibration:
         device = self._devices[name]
         known = None if self.settings.rig is None else self.settings.rig.cameras.get(name)
         with MemoryBus(self._network) as bus:
-            CameraAgent(device, self._detectors[name], bus, name, known=known, pictures_hz=5.0).run(self._stop_cameras)
+            CameraAgent(device, self._detectors[name], bus, name, known=known, pictures_hz=5.0, target="ball").run(
+                self._stop_cameras
+            )
 
     def _run_hub(self) -> None:
         with MemoryBus(self._network) as bus:
@@ -241,7 +243,7 @@ class QuickCalibration:
             return
         self._set_marker_model(model)
         self._show_message(
-            f"marker learned from {camera}, a box of {box[2]}×{box[3]} pixels: now wave it through all images"
+            f"ball learned from {camera}, a box of {box[2]}×{box[3]} pixels: now wave it through all images"
         )
 
     def _teach_target(self, *box: float) -> None:

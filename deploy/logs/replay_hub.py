@@ -68,7 +68,7 @@ def replay_through_hub(
                 hub.handle(logged.message)
                 count += publish()
             if first_ns is None:
-                raise InputError("no observation in this log", file=log, remedy="record cameras that see the marker")
+                raise InputError("no observation in this log", file=log, remedy="record cameras that see what moves")
             count += publish(final=True)
         temporary.replace(out)
     finally:

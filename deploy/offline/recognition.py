@@ -15,7 +15,7 @@ import numpy.typing as npt
 from edge.detectors.base import Detector
 from edge.detectors.board.description import BOARD_FILE, Board, BoardKind, load_dictionary, read_board
 from edge.detectors.board.detector import SEARCH_PX, BoardDetector
-from edge.detectors.board.finder import Finder
+from edge.detectors.board.finder import Finder, chessboard_of_any_size
 from edge.detectors.board.saddles import linked_saddles
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
@@ -59,7 +59,7 @@ class Target:
     def text(self) -> str:
         """The target in words."""
         if self.board is None:
-            return {"marker": "marker", "bright": "light"}.get(self.kind, self.kind)
+            return {"marker": "ball", "bright": "light"}.get(self.kind, self.kind)
         return "tag" if self.board.tags and self.board.squares is None else "board"
 
 
@@ -139,7 +139,7 @@ def _look(looks: _Looks, board: Board | None, model: MarkerModel) -> Target:
 def _nothing(tried: list[str]) -> Refused:
     return Refused(
         f"nothing that moves was found in at least {_LEAST_VIDEOS} videos; tried: {', '.join(tried)}; name it with "
-        "--detector, describe a board in board.toml, or teach a marker with `syncline detect marker --teach`"
+        "--detector, describe a board in board.toml, or teach a ball's colour with `syncline detect marker --teach`"
     )
 
 
@@ -243,10 +243,9 @@ class _Looks:
             for image in map(_small, map(_grey, self.images(path))):
                 if not linked_saddles(image, 8):
                     continue
-                flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
-                found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (4, 4), flags)
-                if found and meta is not None and corners is not None:
-                    rows, columns = np.asarray(meta).shape[:2]
+                corners = chessboard_of_any_size(image, 4)
+                if corners is not None:
+                    rows, columns = corners.shape[:2]
                     sizes[max(rows, columns) + 1, min(rows, columns) + 1] += 1
         if not sizes:
             return None

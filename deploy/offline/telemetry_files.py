@@ -18,7 +18,6 @@ from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TELEMETRY
 
-SUFFIXES = (".tlog", ".mcap")
 _MAX_ALIGNMENT_FRAMES = 3600  # two minutes at 30 Hz are enough to estimate the offset
 _MARGIN_S = 3.0  # duration of samples kept before and after the video
 

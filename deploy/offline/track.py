@@ -20,6 +20,7 @@ from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, Tracker, Track
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.files import read_text
+from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from protocols.session.rig import RigCamera, read_rig
 
@@ -124,7 +125,7 @@ def read_telemetry(file: Path) -> TelemetryFile:
 def _sample(row: Floats) -> Telemetry:
     """A sample from a row with time, quaternion and, if present, position."""
     position = row[5:8].copy() if len(row) == 8 and np.isfinite(row[5:8]).all() else None
-    return Telemetry(float(row[0]), _rotation(row[1:5]), position)
+    return Telemetry(float(row[0]), so3.from_quaternion(row[1:5]), position)
 
 
 def _numbers(row: list[str], wanted: Sequence[int], file: Path, line: int) -> Floats:
@@ -141,18 +142,6 @@ def _numbers(row: list[str], wanted: Sequence[int], file: Path, line: int) -> Fl
             remedy = "give a number, or leave it empty"
             raise InputError(f"{cell!r} is not a number", file=file, line=line, remedy=remedy) from None
     return np.array(values, dtype=np.float64)
-
-
-def _rotation(quaternion: Floats) -> Floats:
-    """Rotation matrix ned_from_body (3, 3) of a quaternion w, x, y, z."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) -> None:

@@ -173,7 +173,7 @@ def session_from_videos(
         f"{name}: lag {prior.unix_minus_camera:+.3f} s by the sound tracks, against {next(iter(priors))}"
         for name, prior in list(priors.items())[1:]
     ]
-    if refusal is None and target.kind in DETECTORS and target.kind != "marker":
+    if refusal is None and target.kind in DETECTORS:
         metadata["target"] = target.text
     # [metadata] goes first, so that its keys do not end up in the last camera's table.
     rig_text = tomli_w.dumps({"metadata": metadata, **tables} if metadata else tables)

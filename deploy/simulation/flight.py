@@ -78,13 +78,10 @@ def _write_video(world: FlightWorld, out: Path) -> Path:
 
 
 def _rig(world: FlightWorld) -> dict[str, Any]:
-    width, height = world.size
     table = {
         "name": _CAMERA,
-        "size": [width, height],
         "fps": world.fps,
-        "matrix": world.lens.matrix.tolist(),
-        "distortions": world.lens.distortions.tolist(),
+        **world.lens.table(),
         "body_from_camera": world.body_from_camera.tolist(),
     }
     return {_CAMERA: table, "metadata": {"name": f"{TOWN}:{world.name}", "units": "m"}}
@@ -94,11 +91,8 @@ def _telemetry(samples: list[Telemetry]) -> str:
     """CSV text with time, quaternion ned_from_body, north, east, down; one row per sample."""
     lines = ["time,qw,qx,qy,qz,north,east,down"]
     for sample in samples:
-        turn = so3.log(sample.ned_from_body)
-        angle = float(np.linalg.norm(turn))
-        quaternion = np.r_[np.cos(0.5 * angle), 0.5 * np.sinc(0.5 * angle / np.pi) * turn]
         place = np.full(3, np.nan) if sample.position is None else sample.position
-        lines.append(_row(sample.time, *quaternion, *place))
+        lines.append(_row(sample.time, *so3.quaternion(sample.ned_from_body), *place))
     return "\n".join(lines) + "\n"
 
 

@@ -17,7 +17,6 @@ from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
-from protocols.session.rig import Rig, RigCamera
 
 TRUTH_CALIBRATION, TRUTH_TRAJECTORY = "truth_calibration.toml", "truth_trajectory.csv"
 _TRUTH_HZ = 50.0  # above every camera's frame rate
@@ -77,14 +76,7 @@ def camera_tables(scene: SimulatedScene, name: str) -> tuple[dict[str, Any], dic
     rig: dict[str, Any] = {"metadata": metadata}
     truth: dict[str, Any] = {"metadata": {**metadata, "reference": reference, "scale": "metric"}}
     for camera in scene.cameras:
-        lens = camera.intrinsics
-        rig[camera.name] = {
-            "name": camera.name,
-            "size": [lens.width, lens.height],
-            "fps": camera.fps,
-            "matrix": lens.matrix.tolist(),
-            "distortions": lens.distortions.tolist(),
-        }
+        rig[camera.name] = {"name": camera.name, "fps": camera.fps, **camera.intrinsics.table()}
         time_map = scene.true_time_map(camera.name, reference)
         truth[camera.name] = {
             **rig[camera.name],
@@ -94,18 +86,6 @@ def camera_tables(scene: SimulatedScene, name: str) -> tuple[dict[str, Any], dic
             "clock_rate": time_map.clock_rate,
         }
     return rig, truth
-
-
-def rig_from_tracks(simulated: SimulatedTracks) -> Rig:
-    """The rig of a simulated scene, with intrinsics but without poses."""
-    return Rig(
-        {
-            camera.name: RigCamera(
-                camera.name, (camera.intrinsics.width, camera.intrinsics.height), camera.fps, camera.intrinsics
-            )
-            for camera in simulated.cameras
-        }
-    )
 
 
 def simulated_observations(scene: SimulatedScene, tracks: Mapping[str, SimulatedTrack | PeopleTrack]) -> Observations:

@@ -27,17 +27,9 @@ if TYPE_CHECKING:
     from packaging.requirements import Requirement
 
 _COMMON_PACKAGES = (
-    "cryptography",
-    "cyclopts",
-    "eclipse-zenoh",
-    "msgspec",
-    "numpy",
-    "prometheus-client",
-    "protobuf",
-    "rich",
-    "structlog",
-    "tomli-w",
-)
+    "cryptography", "cyclopts", "eclipse-zenoh", "msgspec", "numpy", "prometheus-client", "protobuf", "rich",
+    "structlog", "tomli-w",
+)  # fmt: skip
 _LOG_PACKAGES = ("mcap", "zstandard", "foxglove-schemas-protobuf")
 ROLE_PACKAGES: dict[str, tuple[str, ...]] = {
     "camera": (*_COMMON_PACKAGES, "opencv-python-headless", "mcap"),

@@ -210,14 +210,7 @@ def _simulated_rig(rig: RigFolder, cameras: Sequence[str]) -> dict[str, Any]:
     )
     where = {name: scene.cameras[index] for index, name in enumerate(cameras)}
     tables: dict[str, Any] = {
-        name: {
-            "name": name,
-            "size": [camera.intrinsics.width, camera.intrinsics.height],
-            "fps": camera.fps,
-            "matrix": camera.intrinsics.matrix.tolist(),
-            "distortions": camera.intrinsics.distortions.tolist(),
-        }
-        for name, camera in where.items()
+        name: {"name": name, "fps": camera.fps, **camera.intrinsics.table()} for name, camera in where.items()
     }
     metadata: dict[str, Any] = {"name": f"{rig.name}, simulated", "units": "m"}
     wanted = {frozenset((a, b)) for a, b, _ in (() if rig.rig is None else rig.rig.distances)}

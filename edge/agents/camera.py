@@ -47,7 +47,8 @@ class CameraAgent:
     and latencies; observations are never stamped with it. known: the camera's entry in the rig file (intrinsics, pose).
     boot_id: by default a new one for each process start. pictures_hz, picture_width: rate and width [px] of the
     thumbnails, which are published only while somebody subscribes; a rate of 0 disables them.
-    predictions: whether the hub's predicted detections are passed to the detector.
+    predictions: whether the hub's predicted detections are passed to the detector. target: what it looks for, in one
+    word, for advice to the user.
     """
 
     def __init__(
@@ -63,7 +64,9 @@ class CameraAgent:
         pictures_hz: float = 2.0,
         picture_width: int = THUMBNAIL_WIDTH,
         predictions: bool = False,
+        target: str = "",
     ) -> None:
+        self._target = target
         self._uses_predictions = predictions
         self._predictions: PredictionSubscriber | None = None
         self._device = device
@@ -195,6 +198,7 @@ class CameraAgent:
             driver=info.driver,
             clock=info.clock,
             readout_s=info.readout_s,
+            target=self._target,
         )
         known = self._known
         lens = info.intrinsics if known is None or known.intrinsics is None else known.intrinsics

@@ -262,16 +262,6 @@ def _minimise(
 
 
 __all__ = [
-    "LinearisedResiduals",
-    "SmoothnessPrior",
-    "adjust",
-    "apply_step",
-    "build_system",
-    "estimate_noise",
-    "estimate_smoothness",
-    "gauge_tangent",
-    "linearise",
-    "mark_inliers",
-    "predict",
-    "residual_norms",
-]
+    "LinearisedResiduals", "SmoothnessPrior", "adjust", "apply_step", "build_system", "estimate_noise",
+    "estimate_smoothness", "gauge_tangent", "linearise", "mark_inliers", "predict", "residual_norms",
+]  # fmt: skip

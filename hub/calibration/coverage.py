@@ -1,7 +1,7 @@
-"""Image coverage of the marker, and advice where to move it: which camera has seen too little of it, and where.
+"""Image coverage of the target, and advice where to move it: which camera has seen too little of it, and where.
 
 A pure estimator: observations in, advice out. Two cameras are calibrated well by motion that crosses much of both
-images; a marker that stays in one corner constrains a pose only as far as that corner does.
+images; a target that stays in one corner constrains a pose only as far as that corner does.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from hub.report.measures import COLUMNS, ROWS, covered_cells
+from hub.report.wording import ANY, VERBS, target_of
 from protocols.geometry.types import Bools
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -21,18 +22,9 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
 
 MIN_COVERAGE = 0.35
-"""Share of the image cells in which the marker should have been seen."""
+"""Share of the image cells in which the target should have been seen."""
 MIN_DETECTIONS = 90
 """Detections below which a camera can hardly be calibrated with another."""
-_VERBS = {
-    "marker": "wave it",
-    "board": "show it",
-    "tag": "show it",
-    "light": "move it",
-    "person": "walk",
-    "vehicle": "drive",
-}
-"""What the user does with the target, by its name."""
 _MAX_ADVICE = 2  # pieces of advice at a time: people do not follow more
 _MAX_ADVISED = 64  # cameras that are considered: of a thousand it would take a second
 
@@ -41,8 +33,8 @@ Kind = Literal["silent", "unseen", "few", "narrow"]
 
 @dataclass(frozen=True, slots=True)
 class CoverageAdvice:
-    """Advice on one camera. coverage: share of its image in which it saw the marker, 0..1. regions: parts of the image
-    without the marker, as words ("left", "top right"). text: the sentence for a person."""
+    """Advice on one camera. coverage: share of its image in which it saw the target, 0..1. regions: parts of the image
+    without the target, as words ("left", "top right"). text: the sentence for a person."""
 
     camera: str
     kind: Kind
@@ -52,10 +44,11 @@ class CoverageAdvice:
 
 
 class CoverageMonitor:
-    """Counts detections of the marker in the cells of each camera's image."""
+    """Counts detections of the target in the cells of each camera's image."""
 
     def __init__(self) -> None:
         self._sizes: dict[str, tuple[int, int]] = {}
+        self._targets: dict[str, str] = {}
         self._counts: dict[str, np.ndarray[tuple[int, int], np.dtype[np.int64]]] = {}
         self._frames: dict[str, int] = {}
         self._rows: dict[str, int] = {}
@@ -66,6 +59,7 @@ class CoverageMonitor:
 
         if isinstance(message, pb.CameraInfo):
             self._sizes[message.camera] = (message.width, message.height)
+            self._targets[message.camera] = message.target if message.target in VERBS else ANY
             self._counts.setdefault(message.camera, np.zeros((ROWS, COLUMNS), dtype=np.int64))
         elif isinstance(message, pb.Observation):
             name = message.camera
@@ -87,41 +81,42 @@ class CoverageMonitor:
         self._rows.clear()
 
     def covered_cells(self, camera: str) -> Bools:
-        """(ROWS, COLUMNS): cells of a camera's image in which it saw the marker."""
+        """(ROWS, COLUMNS): cells of a camera's image in which it saw the target."""
         counts = self._counts.get(camera)
         return np.zeros((ROWS, COLUMNS), dtype=np.bool_) if counts is None else np.asarray(counts > 0)
 
     def coverage(self, camera: str) -> float:
-        """Share of a camera's image in which it saw the marker, 0..1."""
+        """Share of a camera's image in which it saw the target, 0..1."""
         return float(self.covered_cells(camera).mean())
+
+    @property
+    def target(self) -> str:
+        """What the user moves, in one word: what most cameras look for."""
+        sought = list(self._targets.values())
+        return max(sought, key=sought.count, default=ANY)
+
+    def instruction(self) -> str:
+        """What to do with the target: "wave the ball", "walk about"."""
+        verb = VERBS.get(self.target, "move it")
+        return verb.replace("it", f"the {self.target}") if verb.endswith(" it") else f"{verb} about"
 
     def advice(self, max_advice: int = _MAX_ADVICE) -> list[CoverageAdvice]:
         """Advice, the most urgent first; empty when every camera has seen enough."""
         cameras = sorted({*self._sizes, *self._frames})[:_MAX_ADVISED]
+        frames, rows = self._frames.get, self._rows.get
         found = [
-            camera_advice(name, self._frames.get(name, 0), self._rows.get(name, 0), self.covered_cells(name))
+            camera_advice(name, frames(name, 0), rows(name, 0), self.covered_cells(name), self._targets.get(name, ANY))
             for name in cameras
         ]
         return _most_urgent([advice for advice in found if advice is not None], max_advice)
 
 
-def target_of(rig: Rig, labels: list[str]) -> str:
-    """What the user moves, in one word: as the session or the only label says, a board where there are bodies, a person
-    with joints."""
-    given = rig.metadata.get("target", labels[0] if len(labels) == 1 else None)
-    if isinstance(given, str) and given in _VERBS:
-        return given
-    if rig.bodies:
-        return "board" if max(len(body) for body in rig.bodies.values()) > 4 else "tag"
-    return "person" if any(label.endswith(("hip", "knee", "shoulder")) for label in labels) else "marker"
-
-
-def camera_advice(camera: str, frames: int, rows: int, covered: Bools, target: str = "marker") -> CoverageAdvice | None:
+def camera_advice(camera: str, frames: int, rows: int, covered: Bools, target: str = ANY) -> CoverageAdvice | None:
     """Advice on one camera, None if none is needed. frames: received from it; rows: those with a detection.
 
     target: what the user moves, see `target_of`.
     """
-    do = _VERBS.get(target, "move it")
+    do = VERBS.get(target, "move it")
     share = float(covered.mean())
     regions = uncovered_regions(covered)
     if frames == 0:
@@ -157,7 +152,7 @@ def session_advice(
 
 
 def uncovered_regions(covered: Bools) -> tuple[str, ...]:
-    """Sides and corners of the image without the marker, the emptiest first.
+    """Sides and corners of the image without the target, the emptiest first.
 
     covered: (ROWS, COLUMNS). A side is named if at least two thirds of the outer third of the image there are empty,
     not counting cells of a side already named.

@@ -288,7 +288,8 @@ class LiveHub:
             return ""
         if len(ready) < 2:
             counts = _listed(f"{name} {rows}" for name, rows in rows_by_camera.items())
-            return f"too few detections yet ({counts}; two cameras need {self.settings.least_rows}): move the marker"
+            what = self.guidance.instruction()
+            return f"too few detections yet ({counts}; two cameras need {self.settings.least_rows}): {what}"
         return ""
 
     def tick(self, now: float, final: bool = False) -> list[Message]:

@@ -17,6 +17,7 @@ from hub.report.quality_assessment import (
 )
 from hub.report.style import STYLE
 from hub.report.svg import THIN, esc, number, short, whole
+from hub.report.wording import in_words_of
 from protocols.core.errors import Refused
 from protocols.core.version import VERSION
 from protocols.session.calibration import Calibration
@@ -71,8 +72,10 @@ def build_report(
     stds of a live hub's calibrations over a log.
     """
     if isinstance(outcome, Refused):
-        return _refusal_page(outcome, rig, observations, command)
-    return _calibration_page(outcome, rig, observations, command, history)
+        page = _refusal_page(outcome, rig, observations, command)
+    else:
+        page = _calibration_page(outcome, rig, observations, command, history)
+    return in_words_of(page, rig, observations.labels)
 
 
 def _calibration_page(

@@ -172,8 +172,8 @@ def frame_detections(
 
 
 def tracked_kind(detection: pb.Detection) -> str:
-    """The kind under which a detection is tracked; "" for a labelled marker, which is identified by its label."""
-    if detection.kind == "marker":
+    """The kind under which a detection is tracked; "" for a labelled marker or corner: its label identifies it."""
+    if detection.kind in ("marker", "corner"):
         return "" if detection.label else "marker"
     return str(detection.kind)
 

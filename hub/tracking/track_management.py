@@ -44,7 +44,6 @@ _MAX_OVERLAP, _MIN_OVERLAP = 3.0, -6.0
 """Log likelihood ratio from which on two tracks are one person (20 to 1), and its limit below."""
 _FLOOR_GATE = 0.25
 """Of a foot's height above the floor, as a fraction of the size."""
-_FLOOR_EVERY_S = 0.1
 _UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 
 

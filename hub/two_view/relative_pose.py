@@ -260,8 +260,3 @@ def orthogonal_axes(direction: Floats) -> Floats:
     length = (first[0] ** 2 + first[1] ** 2 + first[2] ** 2) ** 0.5
     p, q, r = (value / length for value in first)
     return np.array([[p, q, r], [y * r - z * q, z * p - x * r, x * q - y * p]])
-
-
-def tangent_basis(direction: Floats) -> Floats:
-    """Two unit vectors (3, 2) orthogonal to ``direction`` (3,) and to each other."""
-    return orthogonal_axes(direction).T

@@ -167,7 +167,7 @@ class ViewPage:
         with gui.add_folder("Show", expand_by_default=False):
             for name, label in (
                 ("pictures", "pictures"),
-                ("rays", "rays to the marker"),
+                ("rays", "rays to the target"),
                 ("paths", "paths"),
                 ("uncertainty", "uncertainty (3 std)"),
             ):

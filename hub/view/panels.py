@@ -78,7 +78,8 @@ def waiting_html(state: ViewState) -> str:
         parts = [camera.reason[:120]] if camera.reason else []
         if progress is not None:
             parts.append(f"{progress.shared_motion_s:.0f} s of motion shared with another camera")
-        parts.append(f"marker seen in {100 * share:.0f} % of its view, {100 * MIN_COVERAGE:.0f} % wanted")
+        wanted = f"{100 * MIN_COVERAGE:.0f} % wanted"
+        parts.append(f"{state.guidance.target} seen in {100 * share:.0f} % of its view, {wanted}")
         name = html.escape(camera.name, quote=True)
         bar = f"<progress max='1' value='{min(share / MIN_COVERAGE, 1.0):.2f}'></progress>"
         words = html.escape(f"{camera.verdict}: {' · '.join(parts)}")
@@ -219,7 +220,7 @@ def _tile(camera: CameraView, now: float, *, wanted: bool) -> str:
 
 
 def camera_details(state: ViewState, camera: CameraView, now: float) -> str:
-    """All data of one camera, and the coverage of its image by the marker."""
+    """All data of one camera, and the coverage of its image by the target."""
     status = camera.state(now)
     info = camera.info
     lines = [f"<b>{SIGNS[status]} {html.escape(camera.name)}: {status}</b>"]
@@ -228,7 +229,8 @@ def camera_details(state: ViewState, camera: CameraView, now: float) -> str:
     if info is not None:
         lens = "intrinsics known" if len(info.matrix) == 9 else "no intrinsics: timing only"
         lines.append(f"{info.width}×{info.height}, {info.fps:g} fps nominal, {html.escape(info.driver)}, {lens}")
-    lines.append(f"{camera.frames} frames, marker in {camera.seen}, {camera.lost} lost, {camera.restarts} restarts")
+    seen = f"{state.guidance.target} in {camera.seen}"
+    lines.append(f"{camera.frames} frames, {seen}, {camera.lost} lost, {camera.restarts} restarts")
     if camera.refusals:
         lines.append(f"refused {camera.refusals} times so far")
     pose, found = camera.pose, camera.calibration
@@ -239,7 +241,7 @@ def camera_details(state: ViewState, camera: CameraView, now: float) -> str:
     covered = state.guidance.covered_cells(camera.name)
     grid = "\n".join("".join("■" if covered[row, column] else "□" for column in range(COLUMNS)) for row in range(ROWS))
     share = 100 * state.guidance.coverage(camera.name)
-    lines.append(f"marker seen in {share:.0f} % of the image:<div class='grid'>{grid}</div>")
+    lines.append(f"{state.guidance.target} seen in {share:.0f} % of the image:<div class='grid'>{grid}</div>")
     return f"{_STYLE}<div class='sl'>{''.join(f'<p>{line}</p>' for line in lines)}</div>"
 
 

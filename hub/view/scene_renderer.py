@@ -12,6 +12,7 @@ import numpy.typing as npt
 from hub.view.panels import SIGNS, track_text
 from hub.view.state import CameraState, CameraView, PathView, ViewState
 from protocols.core.jpeg import decode_jpeg
+from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
@@ -180,7 +181,7 @@ class SceneRenderer:
         found = camera.calibration
         assert found is not None
         name, scale = camera.name, 0.07 * self._size
-        place = (tuple(pose.position), tuple(_quaternion(pose.rotation.T)), status, round(scale, 3))
+        place = (tuple(pose.position), tuple(so3.quaternion(pose.rotation.T)), status, round(scale, 3))
         if self._drawn.get(f"camera {name}") != place:
             self._drawn[f"camera {name}"] = place
             frustum = self._frusta.get(name)
@@ -191,7 +192,7 @@ class SceneRenderer:
                 )
                 self._frusta[name] = frustum
                 self._labels[name] = self._scene.add_label(f"/labels/{name}", "", anchor="bottom-center")
-            frustum.wxyz, frustum.position = _quaternion(pose.rotation.T), pose.position
+            frustum.wxyz, frustum.position = so3.quaternion(pose.rotation.T), pose.position
             frustum.scale, frustum.color = scale, COLOURS[status]
             self._labels[name].position = pose.position + 0.25 * scale * _up({name: pose})
             self.frusta_moved += 1
@@ -440,12 +441,6 @@ def _up(placed: dict[str, Pose]) -> Floats:
     axis[int(np.argmax(np.abs(mean)))] = math.copysign(1.0, mean[int(np.argmax(np.abs(mean)))])
     # A world axis that is nearly up is taken as up.
     return axis if float(axis @ mean) > 0.8 else mean
-
-
-def _quaternion(rotation: Floats) -> Floats:
-    import viser.transforms
-
-    return np.asarray(viser.transforms.SO3.from_matrix(rotation).wxyz, dtype=np.float64)
 
 
 def _quaternion_z_to(up: Floats) -> Floats:

@@ -61,15 +61,7 @@ def rig_tables(rig: ForeignRig, units: str) -> dict[str, Any]:
         metadata["scale"] = rig.scale
     tables: dict[str, Any] = {"metadata": metadata}
     for name, camera in rig.cameras.items():
-        lens = camera.intrinsics
-        table: dict[str, Any] = {
-            "name": name,
-            "size": [lens.width, lens.height],
-            "matrix": lens.matrix.tolist(),
-            "distortions": lens.distortions.tolist(),
-        }
-        if lens.fisheye:
-            table["fisheye"] = True
+        table: dict[str, Any] = {"name": name, **camera.intrinsics.table()}
         if camera.pose is not None:
             table["rotation"] = camera.pose.rodrigues.tolist()
             table["translation"] = camera.pose.translation.tolist()

@@ -38,11 +38,8 @@ _SKELETONS = {
         left_pinky right_pinky left_index right_index left_thumb right_thumb left_hip right_hip left_knee right_knee
         left_ankle right_ankle left_heel right_heel left_foot_index right_foot_index""",
 }
-_COCO, _OPENPOSE_18, _BODY_25, _MEDIAPIPE = (
-    _SKELETONS[name].split() for name in ("coco", "openpose_18", "body_25", "mediapipe")
-)
-_HALPE = [*_COCO, *_SKELETONS["halpe"].split()]
-_NAMES = {17: _COCO, 18: _OPENPOSE_18, 25: _BODY_25, 26: _HALPE, 33: _MEDIAPIPE}
+_COCO, _HALPE, _BODY_25, _OPENPOSE_18, _MEDIAPIPE = map(str.split, _SKELETONS.values())
+_NAMES = {17: _COCO, 18: _OPENPOSE_18, 25: _BODY_25, 26: [*_COCO, *_HALPE], 33: _MEDIAPIPE}
 _LIMBS = {("hip", "knee"): 0.245, ("knee", "ankle"): 0.246}
 """Lengths over the height of a person: D. Winter, "Biomechanics and Motor Control of Human Movement", figure 4.1."""
 
@@ -131,6 +128,8 @@ def read(kind: str, paths: list[Path], camera: str | None) -> list[CameraKeypoin
             out.append(CameraKeypoints(_name(path, camera), path, list(reader(path)), kind == "mediapipe"))
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, OSError) as error:
             what = f"this is no {kind} file as we know it ({type(error).__name__}: {str(error)[:80]})"
+            if isinstance(error, KeyError):
+                what = f"looks like a file of {kind}, but key {error.args[0]} is missing"
             raise InputError(what, file=path, remedy="export it again, or name its format with --format") from None
     twice = next((one for i, one in enumerate(out) if one.camera in {o.camera for o in out[:i]}), None)
     if twice is not None:

@@ -33,9 +33,18 @@ _LAYOUTS = {
     "Syncline's boxes.csv": "camera frame time x y width height",
     "DeepLabCut's CSV": "scorer bodyparts coords",
     "ROS' camera_info": "image_width image_height camera_name camera_matrix distortion_model distortion_coefficients",
+    "OpenCV's calibration": "camera_matrix distortion_coefficients image_width image_height",
+    "Kalibr's camchain": "camera_model intrinsics distortion_model distortion_coeffs resolution",
+    "caliscope's camera_array.toml": "cameras. cam_id size matrix distortions",
+    "aniposelib's calibration": "name size matrix distortions rotation translation",
+    "OpenSfM's reconstruction.json": "cameras shots rotation translation projection_type",
+    "MMPose's JSON": "instances keypoints keypoint_scores",
+    "COCO keypoints": "images annotations image_id keypoints",
+    "MediaPipe's export": "landmarks x y visibility",
 }
 """Columns of tables by name, or rows or keys, for what is nearly one of them."""
-_PARTS = {"DeepLabCut's CSV": "row", "ROS' camera_info": "key"}
+_KEY = re.compile(r'[{,]\s*"(\w+)"\s*:|^\s*-?\s*"?(\w+)"?\s*[:=]|^\s*\[(cameras\.)', re.MULTILINE)
+"""Keys in JSON, YAML and TOML."""
 
 
 @dataclass(slots=True)
@@ -70,7 +79,9 @@ def detect_format(text: str) -> str | None:
 def nearest_layout(text: str) -> str:
     """Which known table the beginning of a text is nearest to, and what it lacks; "" where it resembles none."""
     lines = text.splitlines() or [""]
-    header = [cell.strip().lower() for cell in [*lines[0].split(","), *(re.split("[,:]", line)[0] for line in lines)]]
+    columns_found, rows = lines[0].split(","), [line.split(",")[0] for line in lines]
+    keys = {"".join(found).lower() for found in _KEY.findall(text)}
+    header = keys or {cell.strip().lower() for cell in [*columns_found, *rows]}
     found = []
     for name, columns in _LAYOUTS.items():
         wanted = columns.split()
@@ -79,7 +90,8 @@ def nearest_layout(text: str) -> str:
     share, name, missing = min(found)
     if share > 0.5 or not missing:
         return ""
-    return f"looks like {name}, but {_PARTS.get(name, 'column')} {', '.join(missing)} is missing"
+    part = "key" if keys else "row" if name == "DeepLabCut's CSV" else "column"
+    return f"looks like {name}, but {part} {', '.join(missing).rstrip('.')} is missing"
 
 
 def read(kind: str, files: list[Path], times: Times, likelihood: float, camera: str | None) -> Observations:
@@ -131,12 +143,9 @@ def _caliscope(file: Path, rows: _Rows, times: Times) -> None:
     if missing or ids is None or of_point is None:
         remedy = "give caliscope's xy_….csv or image_points.csv"
         raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
-    timed = "frame_time" in place
-    objects = (
-        len({cells[place["object_id"]] for _, cells in table[1:] if len(cells) == len(header)})
-        if "object_id" in place
-        else 1
-    )
+    whole = [cells for _, cells in table[1:] if len(cells) == len(header)]
+    timed = "frame_time" in place and all(cells[place["frame_time"]].strip() for cells in whole)
+    objects = len({cells[place["object_id"]] for cells in whole}) if "object_id" in place else 1
     begin = len(rows.camera)
     counted = "frame_index" if "frame_index" in place else "sync_index"
     for line, cells in table[1:]:

@@ -7,7 +7,8 @@ which these four tools ignore.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,13 +80,15 @@ def write(
     """A calibration for ``project`` as one file ``name``, in that project's units."""
     wanted = PROJECT_UNITS[project] or units
     converted, warnings = convert_units(cameras, units, wanted, scale)
-    tables = {key: _table(project, number, camera) for number, (key, camera) in enumerate(converted.items())}
+    numbers, note = caliscope_numbers(converted)
+    tables = {key: _table(project, numbers[key], camera) for key, camera in converted.items()}
     metadata = {"adjusted": False, "error": 0.0, "units": wanted, "scale": scale}
     if project == "caliscope":
         document: dict[str, Any] = {
             "metadata": metadata,
             "cameras": {str(table["cam_id"]): table for table in tables.values()},
         }
+        warnings += note
     elif project == "pose2sim":
         document = {**tables, "metadata": metadata}
     else:
@@ -96,8 +99,20 @@ def write(
     return ExportedFiles({name: tomli_w.dumps(document)}, warnings)
 
 
+def caliscope_numbers(names: Iterable[str]) -> tuple[dict[str, int], tuple[str, ...]]:
+    """Numbers of cameras for caliscope: those in names like cam_3 or cam3; others are counted, and a note says how."""
+    given = {name: re.fullmatch(r"cam_?(0|[1-9]\d{0,8})", name) for name in names}
+    found = {name: int(match[1]) for name, match in given.items() if match}
+    if len(found) == len(given) == len(set(found.values())):
+        return found, ()
+    counted = {name: number for number, name in enumerate(given)}
+    listed = ", ".join(f"cam_{number} is {name}" for name, number in counted.items())
+    return counted, (f"caliscope numbers its cameras: {listed}",)
+
+
 def _as_ours(table: dict[str, Any], key: str, project: str) -> dict[str, Any]:
     """A tool's camera table with rig.toml's keys and value types."""
+    table = {key: value for key, value in table.items() if value != "null"}  # caliscope's older word for nothing
     table.setdefault("name", f"cam_{key}" if project == "caliscope" else key)
     if not isinstance(table["name"], str):
         table["name"] = str(table["name"])
@@ -137,13 +152,11 @@ def _table(project: str, number: int, camera: CameraCalibration) -> dict[str, An
     lens, pose = camera.intrinsics, camera.pose
     table: dict[str, Any] = {
         "name": camera.name,
-        "size": [lens.width, lens.height],
-        "matrix": lens.matrix.tolist(),
-        "distortions": lens.distortions.tolist(),
+        **lens.table(),
         "rotation": pose.rodrigues.tolist(),
         "translation": pose.translation.tolist(),
     }
-    if lens.fisheye or project in ("pose2sim", "caliscope"):
+    if project in ("pose2sim", "caliscope"):
         table["fisheye"] = lens.fisheye
     if project == "caliscope":
         table |= {"cam_id": number, "rotation_count": 0, "error": camera.rms_px, "grid_count": 0}

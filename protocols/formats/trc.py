@@ -29,7 +29,7 @@ class TrajectoryGrid:
 def read_grid(file: Path, units: str, wanted: str) -> TrajectoryGrid:
     """A trajectory.csv or track.csv in ``wanted`` units on a grid. Raises InputError: file, line, what, remedy."""
     paths = _read_paths(file)
-    times, frames = _frames(paths)
+    times, frames = grid_frames(paths)
     count = int(frames[-1]) + 1
     rate = (count - 1) / float(times[-1] - times[0]) if count > 1 else 1.0
     scale = METRES_PER_UNIT[units] / METRES_PER_UNIT[wanted]
@@ -64,7 +64,7 @@ def trc_text(file: Path, name: str, units: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _frames(paths: Mapping[str, Floats]) -> tuple[Floats, Ints]:
+def grid_frames(paths: Mapping[str, Floats]) -> tuple[Floats, Ints]:
     """All times (n,) [s] of some trajectories and the frame (n,) of each on one grid of constant rate.
 
     The grid's step is the 10 % quantile of the trajectories' own steps; gaps are multiples of it.

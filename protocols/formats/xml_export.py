@@ -15,6 +15,7 @@ import numpy as np
 from protocols.core.errors import Refused
 from protocols.formats.cameras import ExportedFiles, check_skew, convert_units, fit_without_k3
 from protocols.formats.xml_rigs import FROM_Y_UP, QUALISYS_UNIT
+from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration
 
@@ -83,7 +84,7 @@ def _vicon(cameras: Mapping[str, CameraCalibration], lost: list[str]) -> Element
         frame.set("FOCAL_LENGTH", _number(m[0, 0]))
         frame.set("PRINCIPAL_POINT", _row(m[:2, 2]))
         frame.set("POSITION", _row(camera.pose.position))
-        frame.set("ORIENTATION", _row(_quaternion(camera.pose.rodrigues)))
+        frame.set("ORIENTATION", _row(np.roll(so3.quaternion(camera.pose.rotation), -1)))
         frame.set("VICON_RADIAL", _row(bent[:2]))
         frame.set("VICON_RADIAL2", f"ViconRadial2 {_row(m[:2, 2])} {_row(bent[:2])} 0")
     return root
@@ -108,12 +109,6 @@ def _optitrack(cameras: Mapping[str, CameraCalibration], lost: list[str]) -> Ele
 
 def _add(parent: ElementTree.Element, name: str, values: Mapping[str, float]) -> None:
     ElementTree.SubElement(parent, name, {key: _number(value) for key, value in values.items()})
-
-
-def _quaternion(rodrigues: Floats) -> Floats:
-    """x, y, z, w of a rotation vector."""
-    angle = float(np.linalg.norm(rodrigues))
-    return np.asarray(np.r_[0.5 * np.sinc(angle / (2.0 * np.pi)) * rodrigues, np.cos(0.5 * angle)])
 
 
 def _number(value: float) -> str:

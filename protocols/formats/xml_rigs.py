@@ -102,12 +102,8 @@ def _vicon(root: ElementTree.Element, file: Path) -> Iterator[tuple[str, bool, F
             raise InputError(f"{name}: PIXEL_ASPECT_RATIO is not above 0", file=file, remedy="correct it")
         lens = (focal, focal / aspect, float(centre[0]), float(centre[1]))
         intrinsics = _intrinsics(width, height, lens, np.r_[radial, 0.0, 0.0, 0.0], file)
-        x, y, z, w = _words(frame, "ORIENTATION", 4, file, name)
-        axis = np.array([x, y, z])
-        size = float(np.linalg.norm(axis))
-        turn = so3.exp(2.0 * np.arctan2(size, w) / size * axis) if size > 1e-12 else np.eye(3)
-        position = _words(frame, "POSITION", 3, file, name)
-        pose = Pose(turn, position)
+        turn = so3.from_quaternion(np.roll(_words(frame, "ORIENTATION", 4, file, name), 1))
+        pose = Pose(turn, _words(frame, "POSITION", 3, file, name))
         yield name, "video" in tag.get("TYPE", "video").lower(), ForeignCamera(name, intrinsics, pose)
 
 

@@ -44,6 +44,12 @@ class Intrinsics:
         slope = np.r_[1.0, radial * (3.0 + 2.0 * np.arange(len(radial)))]
         object.__setattr__(self, "fold", _first_fold(slope))
 
+    def table(self) -> dict[str, Any]:
+        """Its keys in rig.toml."""
+        fisheye = {"fisheye": True} if self.fisheye else {}
+        size = [self.width, self.height]
+        return {"size": size, "matrix": self.matrix.tolist(), "distortions": self.distortions.tolist(), **fisheye}
+
     @classmethod
     def of_message(cls, message: Any, size: tuple[int, int] | None = None) -> Intrinsics | None:
         """Those in a bus message with matrix, distortions and fisheye; None where it has none.

@@ -382,15 +382,16 @@ class SessionBuilder:
     def _build_rig(self, order: list[str]) -> Rig:
         info = self._rig
         cameras = {name: rig_camera_from_info(self._cameras[name]) for name in order}
+        sought = {self._cameras[name].target for name in order}
+        metadata: dict[str, Any] = {"target": min(sought)} if len(sought) == 1 and any(sought) else {}
         if info is None:
-            return Rig(cameras)
+            return Rig(cameras, metadata=metadata)
         inside = [d for d in info.distances if d.camera_a in cameras and d.camera_b in cameras]
         up: Floats | str | None = None
         if info.up_camera in cameras:
             up = info.up_camera
         elif len(info.up) == 3:
             up = np.array(info.up) / np.linalg.norm(info.up)
-        metadata: dict[str, Any] = {}
         if info.reference_camera:
             metadata["reference"] = info.reference_camera
         return Rig(

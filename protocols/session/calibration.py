@@ -13,7 +13,7 @@ import tomli_w
 from protocols.core.acceptance import AcceptanceTest
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
-from protocols.core.files import read_toml, write_atomically
+from protocols.core.files import read_toml
 from protocols.core.pair_report import PairReport
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
@@ -22,18 +22,9 @@ from protocols.geometry.types import Floats
 from protocols.session.rig import Rig, read_rig
 
 _REPLACED_METADATA = (
-    "distances",
-    "wand",
-    "bodies",
-    "bodies_scale",
-    "in_step",
-    "target",
-    "refused",
-    "scale",
-    "solver",
-    "version",
+    "distances", "wand", "bodies", "bodies_scale", "in_step", "target", "refused", "scale", "solver", "version",
     "reference",
-)
+)  # fmt: skip
 """Metadata keys of rig.toml that the result replaces."""
 
 
@@ -161,7 +152,6 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
         "version": calibration.version,
     }
     for name, camera in calibration.cameras.items():
-        lens = camera.intrinsics
         table = dict(rig.cameras[name].table) if name in rig.cameras else {}
         # A surveyed position is an input: the estimate is the translation, and two values that differ by the
         # survey's error would contradict each other.
@@ -169,9 +159,7 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
             table.pop(key, None)
         table |= {
             "name": name,
-            "size": [lens.width, lens.height],
-            "matrix": lens.matrix.tolist(),
-            "distortions": lens.distortions.tolist(),
+            **camera.intrinsics.table(),
             "rotation": camera.pose.rodrigues.tolist(),
             "translation": camera.pose.translation.tolist(),
             "time_offset": camera.time_map.time_offset,
@@ -180,8 +168,6 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
             "position_std": camera.position_std.tolist(),
             "rms_px": camera.rms_px,
         }
-        if lens.fisheye:
-            table["fisheye"] = True
         if camera.focal_std > 0.0:
             table["focal_std"] = camera.focal_std
         if camera.readout != 0.0:
@@ -198,16 +184,6 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
 def calibration_text(calibration: Calibration, rig: Rig) -> str:
     """The text of calibration.toml, which aniposelib loads unchanged."""
     return tomli_w.dumps(_plain(calibration_tables(calibration, rig)))
-
-
-def write_calibration(file: Path, calibration: Calibration, rig: Rig) -> None:
-    """Write calibration.toml."""
-    write_atomically(file, calibration_text(calibration, rig))
-
-
-def write_trajectory(file: Path, calibration: Calibration) -> None:
-    """Write trajectory.csv."""
-    write_atomically(file, trajectory_text(calibration))
 
 
 def trajectory_text(calibration: Calibration) -> str:

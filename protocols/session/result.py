@@ -6,13 +6,11 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from protocols.core.acceptance import AcceptanceTest
-from protocols.core.files import write_atomically
 from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
 from protocols.session.calibration import Calibration, TrajectoryTable, calibration_tables
@@ -111,11 +109,6 @@ def refusal_document(
 def result_text(document: dict[str, Any]) -> str:
     """Strict JSON (no NaN, no Infinity) whose floats read back bit for bit."""
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def write_result(file: Path, document: dict[str, Any]) -> None:
-    """Write result.json. Raises InputError where the folder cannot be written."""
-    write_atomically(file, result_text(document))
 
 
 def _document(**values: Any) -> dict[str, Any]:

@@ -212,7 +212,7 @@ def _detection(detection: pb.Detection) -> None:
     if detection.covariance:
         _covariance_2d(detection.covariance, "covariance")
     if detection.kind:
-        _one_of(detection.kind, "kind", _KINDS)
+        _one_of(detection.kind, "kind", _KINDS | {"corner"})
     if detection.head:
         _vector(detection.head, "head", (2,), -MAX_PIXEL, MAX_PIXEL)
     if detection.foot:
@@ -252,6 +252,7 @@ def _camera_info(message: pb.CameraInfo) -> None:
     _intrinsics(message)
     _text(message.driver, "driver", MAX_LABEL)
     _text(message.clock, "clock", MAX_LABEL)
+    _text(message.target, "target", MAX_LABEL)
     _bounded(message.position, "position", (0, 3), MAX_LENGTH)
     _bounded(message.rotation, "rotation", (0, 3), MAX_TURN)
     _stds(message.position_std, "position_std", (0, 3), MAX_LENGTH)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.two_view.relative_pose import RelativePose, fundamental_from, relative_pose_between, tangent_basis
+from hub.two_view.relative_pose import RelativePose, fundamental_from, orthogonal_axes, relative_pose_between
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
@@ -184,7 +184,7 @@ def lag_bound(trial: Trial, calibrated: bool) -> float:
     inverse = np.linalg.inv(MATRIX)
     pose = trial.pose
     if calibrated:
-        basis = tangent_basis(pose.direction)
+        basis = orthogonal_axes(pose.direction).T
         changes = [so3.hat(pose.direction) @ so3.hat(axis) @ pose.rotation for axis in np.eye(3)]
         changes += [so3.hat(basis[:, k]) @ pose.rotation for k in range(2)]
         changes = [inverse.T @ change.T @ inverse for change in changes]

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from deploy.simulation.session import rig_from_tracks, simulated_observations
+from deploy.simulation.session import simulated_observations
 from edge import scenes
 from edge.scenes.marker.session import simulate_tracks
 from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
+from tests.support.written import rig_from_tracks
 
 FIRST_SEED = 7000
 CAMERAS = 4

@@ -161,7 +161,7 @@ def test_a_log_can_be_moved_along_its_timeline(tab: Tab, tmp_path: Path) -> None
         page.wait_for_selector("[data-state=collecting]")
         guide = page.inner_text("[data-syncline=guide]")
         assert "cam0" in guide, "what to do next, while it is not solved"
-        assert "%" in guide, "with how much of its view has seen the marker"
+        assert "%" in guide, "with how much of its view has seen the target"
         time = page.get_by_role("textbox").first
         time.fill("30")
         time.press("Enter")

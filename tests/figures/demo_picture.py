@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.simulation.session import rig_from_tracks, simulated_observations
+from deploy.simulation.session import simulated_observations
 from edge import scenes
 from edge.scenes import renderer_for
 from edge.scenes.marker.scene import MarkerScene
@@ -18,6 +18,7 @@ from hub.calibration.pipeline import calibrate
 from protocols.geometry.pose import Pose, fit_similarity
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
+from tests.support.written import rig_from_tracks
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "pictures" / "demo.png"
 SEED, CAMERAS, SECONDS, SHOWN = 1, 3, 20.0, 6.0

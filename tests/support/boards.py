@@ -76,3 +76,47 @@ class BoardRenderer:
         picture = cv2.resize(sharp, self._size, interpolation=cv2.INTER_AREA).astype(np.float32)
         picture += 2.0 * self._noise.standard_normal(picture.shape, dtype=np.float32)
         return np.repeat(np.clip(np.rint(picture), 0, 255).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def cut_chessboards(
+    squares: tuple[int, int], count: int, hidden: int, seed: int, covered: bool = False
+) -> Iterator[tuple[npt.NDArray[np.uint8], Floats]]:
+    """Grey images of a chessboard that a side of the image cuts, and the pixels (n, 2) of all its inner corners.
+
+    hidden: columns, and where that leaves three rows, in every second image rows of corners beyond the border.
+    covered: a grey sheet hides the columns at the board's other end.
+    """
+    rng = np.random.default_rng(seed)
+    columns, rows = squares
+    unit, shape = 27, (640, 480)
+    y, x = np.mgrid[: rows * unit, : columns * unit] // unit
+    sheet = np.pad(np.where((x + y) % 2, 225, 25).astype(np.uint8), unit, constant_values=225)
+    if covered:
+        sheet[:, : 4 * unit] = 127
+    # Where squares meet are the edges of pixels, whose centres are whole numbers.
+    corners = np.array([[i + 2, j + 2] for j in range(rows - 1) for i in range(columns - 1)]) * unit - 0.5
+    texture = cv2.GaussianBlur(rng.integers(0, 255, shape[::-1], dtype=np.uint8), (0, 0), 5).astype(np.float64)
+    background = np.clip((texture - 127) * 6 + 127, 0, 255).astype(np.uint8)
+    size = np.array(sheet.shape[::-1], dtype=np.float64)
+    square = np.array([[0, 0], [size[0], 0], size, [0, size[1]]])
+    for index in range(count):
+        by_rows = not covered and index // 4 % 2 == 1 and rows - 1 - hidden >= 3
+        turn = np.pi / 2 * (index % 4) + rng.uniform(-0.12, 0.12)
+        bent = (square - 0.5 * size) * rng.uniform(0.9, 1.3) * (1 + rng.uniform(-0.06, 0.06, (4, 2)))
+        turned = bent @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        side = (index + by_rows) % 4
+        axis, sign = side % 2, 1 if side < 2 else -1
+
+        def placed(target: Floats) -> tuple[Floats, Floats]:
+            matrix = cv2.getPerspectiveTransform(square.astype(np.float32), target.astype(np.float32))
+            return matrix, cv2.perspectiveTransform(corners[None], matrix)[0]
+
+        grid = placed(turned)[1].reshape(rows - 1, columns - 1, 2)
+        lines = sign * (grid if by_rows else grid.transpose(1, 0, 2))[..., axis]
+        border = sign * 0.5 * (lines[-hidden:].min() + lines[: len(lines) - hidden].max())
+        shift = 0.5 * np.array(shape) - turned.mean(axis=0)
+        shift[axis] = (shape[axis] - 1 if sign > 0 else 0) - border
+        matrix, place = placed(turned + shift)
+        image = cv2.warpPerspective(sheet, matrix, shape, dst=background.copy(), borderMode=cv2.BORDER_TRANSPARENT)
+        noisy = cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(0.0, 2.0, image.shape)
+        yield np.clip(noisy, 0, 255).astype(np.uint8), place

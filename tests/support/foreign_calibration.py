@@ -16,9 +16,7 @@ def calibration_file(file: Path, cameras: Mapping[str, tuple[Intrinsics, Pose]])
     tables = {
         name: {
             "name": name,
-            "size": [lens.width, lens.height],
-            "matrix": lens.matrix.tolist(),
-            "distortions": lens.distortions.tolist(),
+            **lens.table(),
             "rotation": pose.rodrigues.tolist(),
             "translation": pose.translation.tolist(),
         }

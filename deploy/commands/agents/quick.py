@@ -35,7 +35,7 @@ def quick(
 ) -> int:
     """Calibrate the cameras connected to this machine by waving a ball. No configuration file is needed.
 
-    Prints the address of a page that shows the cameras' images, with a ring around the marker. Click on the ball if it
+    Prints the address of a page that shows the cameras' images, with a ring around the ball. Click on the ball if it
     has no ring, and wave it where the page advises. It ends by itself once the clock offset of every camera is known
     to half a millisecond, or with the button Finish. Writes the same files as `syncline calibrate` to --out and opens
     the report.
@@ -59,7 +59,7 @@ def quick(
     out
         Folder for the results.
     target
-        Bounding box x,y,w,h of the marker in pixels in the first camera's first frame, instead of a click.
+        Bounding box x,y,w,h of the ball in pixels in the first camera's first frame, instead of a click.
     rig
         rig.toml with intrinsics or known positions.
     field_of_view

@@ -3,35 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from deploy.commands.common import Json, UnusedSeed, answer, check_file, closing_lines
 from protocols.core.errors import InputError
+
+Format = Literal[
+    "aniposelib", "caliscope", "pose2sim", "freemocap", "opencv", "kalibr", "colmap", "ros", "opensfm", "qualisys",
+    "vicon", "optitrack", "trc", "c3d", "session",
+]  # fmt: skip
 
 
 def export(
     source: Path,
     /,
     *,
-    to: Literal[
-        "aniposelib",
-        "caliscope",
-        "pose2sim",
-        "freemocap",
-        "opencv",
-        "kalibr",
-        "colmap",
-        "ros",
-        "opensfm",
-        "qualisys",
-        "vicon",
-        "optitrack",
-        "trc",
-        "c3d",
-        "session",
-    ]
-    | None = None,
+    to: Format | None = None,
     out: Path,
+    session: Path | None = None,
     units: Literal["m", "cm", "mm"] = "m",
     json: Json = False,
     seed: UnusedSeed = 0,
@@ -50,6 +39,8 @@ def export(
 
     Example: syncline export out/trajectory.csv --to trc --out path.trc
 
+    Example: syncline export out/calibration.toml --to caliscope --session my-session --out capture_volume
+
     Example: syncline export flight.mcap --out my-session
 
     Parameters
@@ -59,21 +50,24 @@ def export(
     to
         The format; for a .mcap log always session.
     out
-        The folder for opencv, ros, colmap and session; the file for all others.
+        The folder for opencv, ros, colmap, session, and for caliscope with --session; the file for all others.
+    session
+        For caliscope: a session folder, an observations file or a log, whose points are written too, as a capture
+        volume: camera_array.toml, image_points.csv (an xy.csv) and world_points.csv, at instants common to all cameras.
     units
         Length unit of a trajectory, for trc and c3d.
     """
     from deploy.offline.exchange import exports
     from protocols.core.files import check_folder, write_together
+    from protocols.formats.c3d import write_c3d
+    from protocols.formats.trc import trc_text
     from protocols.log.read.session import is_log
 
     log = is_log(source)
     if to is None and not log:
-        remedy = (
-            "give --to aniposelib, caliscope, pose2sim, freemocap, opencv, kalibr, colmap, ros, opensfm, qualisys, "
-            "vicon, optitrack, trc or c3d"
-        )
-        raise InputError("--to is missing", file=source, remedy=remedy)
+        raise InputError("--to is missing", file=source, remedy=f"give --to {', '.join(get_args(Format)[:-1])}")
+    if session is not None and to != "caliscope":
+        raise InputError("--session goes with --to caliscope", remedy="leave it out")
     if log and to not in (None, "session"):
         remedy = "calibrate it first, then export its calibration.toml"
         raise InputError(f"a log does not become {to}", file=source, remedy=remedy)
@@ -87,15 +81,17 @@ def export(
         summary = f"{cameras} cameras, {rows} observations"
     else:
         assert to is not None
-        if to in exports.IN_FOLDERS:
+        if to in exports.IN_FOLDERS or session is not None:
             check_folder(out)
         else:
             check_file(out, "a file")
         texts: dict[Path, str] = {}
         if to == "c3d":
-            exports.write_c3d(source, out, units)
+            write_c3d(source, out, units)
         elif to == "trc":
-            texts = exports.trajectory_files(source, out, units)
+            texts = {out: trc_text(source, out.name, units)}
+        elif session is not None:
+            texts, warnings = exports.caliscope_volume(source, session, out)
         else:
             texts, warnings = exports.calibration_files(source, to, out)
         write_together(texts)

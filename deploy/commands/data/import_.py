@@ -9,35 +9,17 @@ from deploy.commands.common import Json, answer, check_file, check_range, check_
 from protocols.core.errors import InputError
 from protocols.core.ranges import MAX_IMAGE_SIDE
 
+Format = Literal[
+    "aniposelib", "caliscope", "pose2sim", "freemocap", "opencv", "kalibr", "colmap", "opensfm", "qualisys", "vicon",
+    "optitrack", "caliscope-points", "deeplabcut", "mvus", "openpose", "mmpose", "coco", "mediapipe", "sleap",
+    "deeplabcut-h5", "freemocap-points", "session",
+]  # fmt: skip
+
 
 def import_(
     *sources: Path,
     out: Path,
-    format: Literal[
-        "aniposelib",
-        "caliscope",
-        "pose2sim",
-        "freemocap",
-        "opencv",
-        "kalibr",
-        "colmap",
-        "opensfm",
-        "qualisys",
-        "vicon",
-        "optitrack",
-        "caliscope-points",
-        "deeplabcut",
-        "mvus",
-        "openpose",
-        "mmpose",
-        "coco",
-        "mediapipe",
-        "sleap",
-        "deeplabcut-h5",
-        "freemocap-points",
-        "session",
-    ]
-    | None = None,
+    format: Format | None = None,
     units: Literal["m", "cm", "mm"] | None = None,
     fps: float | None = None,
     videos: Path | None = None,
@@ -125,24 +107,24 @@ def import_(
         raise InputError("--calibration goes with a session folder", remedy="leave it out")
     warnings: tuple[str, ...] = ()
     if source.kind == "session":
-        delay, jitter = 1e-3 * arrival_delay_ms, 1e-3 * arrival_jitter_ms
-    if source.kind == "session" and session_log.has_objects(source.files[0]):
-        arrivals = None
+        folder, arrivals = source.files[0], None
+        objects = session_log.has_objects(folder)
+        session = None if objects else read_folder(folder)
         if calibration is not None:
-            arrivals = session_log.read_arrivals(calibration, read_rig(calibration), delay, jitter, seed)
-        rig, detections, count = session_log.objects_to_log(source.files[0], calibration, out, arrivals)
-        summary = f"{len(rig.cameras)} cameras, {detections} detections, {count} messages"
-        cameras = list(rig.cameras)
-    elif source.kind == "session":
-        rig, seen = read_folder(source.files[0])
-        arrivals = None
-        if calibration is not None:
-            arrivals = session_log.read_arrivals(calibration, rig, delay, jitter, seed)
-        count = session_log.session_to_log(rig, seen, out, arrivals)
-        warnings = seen.warnings
-        if rig.scale_bars:
-            warnings += ("a log does not store the scale bar: add it to the rig.toml of its export",)
-        summary = f"{len(rig.cameras)} cameras, {len(seen)} observations, {count} messages"
+            timed_rig = read_rig(calibration) if session is None else session[0]
+            delay, jitter = 1e-3 * arrival_delay_ms, 1e-3 * arrival_jitter_ms
+            arrivals = session_log.read_arrivals(calibration, timed_rig, delay, jitter, seed)
+        if session is None:
+            rig, rows, count = session_log.objects_to_log(folder, calibration, out, arrivals)
+        else:
+            rig, seen = session
+            rows, count, warnings = len(seen), session_log.session_to_log(rig, seen, out, arrivals), seen.warnings
+            if rig.scale_bars:
+                warnings += ("a log does not store the scale bar: add it to the rig.toml of its export",)
+            if rig.bodies:
+                warnings += ("a log does not store the board: its corners are single points there",)
+        noun = "detections" if objects else "observations"
+        summary = f"{len(rig.cameras)} cameras, {rows} {noun}, {count} messages"
         cameras = list(rig.cameras)
     elif source.kind in imports.POINTS:
         remedy = "give width x height in pixels: 1920x1080"

@@ -72,7 +72,7 @@ def calibrate(
         Let measured lenses change where the observations support it. Without it they are kept exactly as given, and a
         warning names those that the observations refute.
     marker
-        For videos: appearance of the marker, as written by `syncline detect --teach`. Default: marker.toml in the
+        For videos: appearance of the ball, as written by `syncline detect marker --teach`. Default: marker.toml in the
         folder of videos, otherwise the orange ball of the demo.
     detector
         For videos: what moves in them. charuco, chessboard: the board that board.toml describes. tag: ArUco or AprilTag

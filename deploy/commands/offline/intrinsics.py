@@ -39,7 +39,7 @@ def intrinsics(
     Example: syncline intrinsics board.mp4 --camera cam0 --board charuco --squares 8x5 --out rig.toml
 
     Without a board, --model or --field-of-view give the manufacturer's figure. Such intrinsics are approximate and are
-    marked so (focal_std): `calibrate` then estimates the focal length from the marker's motion, or refuses the camera.
+    marked so (focal_std): `calibrate` then estimates the focal length from what moves, or refuses the camera.
 
     Example: syncline intrinsics cam0.mp4 --model gopro-wide --out rig.toml
 
@@ -109,14 +109,7 @@ def intrinsics(
         lens = fit.intrinsics
         if fit.views < MIN_VIEWS:
             guess_std = fit.focal_std
-    table: dict[str, Any] = {
-        "name": name,
-        "size": [lens.width, lens.height],
-        "matrix": lens.matrix.tolist(),
-        "distortions": lens.distortions.tolist(),
-    }
-    if lens.fisheye:
-        table["fisheye"] = True
+    table: dict[str, Any] = {"name": name, **lens.table()}
     if guess_std:
         table["focal_std"] = guess_std
     write_atomically(out, _completed(out, name, table))
@@ -133,7 +126,7 @@ def intrinsics(
     if fit is None:
         lines = [
             f"{focal} {lens.focal:.1f} px ± {100 * guess_std:.0f} % from the field of view",
-            "approximate: `syncline calibrate` refines it from the marker's motion; a board is more precise",
+            "approximate: `syncline calibrate` refines it from what moves; a board is more precise",
         ]
     else:
         lines = [f"{focal} {lens.focal:.2f} px ± {100 * fit.focal_std:.2g} %, {fit.views} views"]

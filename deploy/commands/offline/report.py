@@ -45,6 +45,7 @@ def report(
     from hub.report import build_report
     from hub.report.measures import row_usage
     from hub.report.quality_assessment import assess_quality, assess_refusal
+    from hub.report.wording import in_words_of
     from protocols.core.files import write_atomically
 
     file = out or (source / "report.html" if (source / "result.json").is_file() else Path("report.html"))
@@ -66,14 +67,10 @@ def report(
             report_input.observations,
             row_usage(outcome, report_input.rig, report_input.observations),
         )
-    summary = {
-        "report": str(file),
-        "level": assessment.level,
-        "verdict": assessment.headline,
-        "todo": assessment.actions,
-    }
-    todo = [f"to do: {line}" for line in assessment.actions]
-    answer(summary, [assessment.headline, *todo, *closing_lines((), [file])], json)
+    rig, labels = report_input.rig, report_input.observations.labels
+    todo = [in_words_of(line, rig, labels) for line in assessment.actions]
+    summary = {"report": str(file), "level": assessment.level, "verdict": assessment.headline, "todo": todo}
+    answer(summary, [assessment.headline, *(f"to do: {line}" for line in todo), *closing_lines((), [file])], json)
     if browser:
         open_browser(file.resolve().as_uri())
     return EXIT_DONE

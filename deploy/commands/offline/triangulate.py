@@ -79,8 +79,9 @@ def _save(result: TriangulationResult, out: Path) -> None:
     """Write the trajectories in the format that the file's suffix names. Raises InputError."""
     from tempfile import TemporaryDirectory
 
-    from deploy.offline.exchange.exports import trajectory_files, write_c3d
-    from protocols.core.files import write_together
+    from protocols.core.files import write_atomically
+    from protocols.formats.c3d import write_c3d
+    from protocols.formats.trc import trc_text
 
     suffix = out.suffix.lower()
     if suffix not in (".trc", ".c3d"):
@@ -92,4 +93,4 @@ def _save(result: TriangulationResult, out: Path) -> None:
         if suffix == ".c3d":
             write_c3d(table, out, result.rig.units)
         else:
-            write_together(trajectory_files(table, out, result.rig.units))
+            write_atomically(out, trc_text(table, out.name, result.rig.units))

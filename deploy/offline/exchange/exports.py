@@ -6,10 +6,10 @@ from pathlib import Path
 
 from protocols.core.errors import InputError
 from protocols.core.files import file_in
-from protocols.formats import colmap, opensfm, ros, toml_rigs, trc, xml_export, yaml_rigs
-from protocols.formats.c3d import write_c3d
+from protocols.formats import caliscope, colmap, opensfm, ros, toml_rigs, xml_export, yaml_rigs
 from protocols.formats.cameras import ExportedFiles, convert_units
 from protocols.session.calibration import read_calibration
+from protocols.session.rig import METRES_PER_UNIT
 
 IN_FOLDERS = ("opencv", "ros", "colmap")
 """Formats with several files, for which --out is a folder."""
@@ -42,9 +42,25 @@ def calibration_files(source: Path, to: str, out: Path) -> tuple[dict[Path, str]
     return {file_in(folder, name): text for name, text in written.files.items()}, written.warnings
 
 
-def trajectory_files(source: Path, out: Path, units: str) -> dict[Path, str]:
-    """The files of a trajectory in the TRC format. Raises InputError."""
-    return {out: trc.trc_text(source, out.name, units)}
+def caliscope_volume(source: Path, session: Path, out: Path) -> tuple[dict[Path, str], tuple[str, ...]]:
+    """The files of a capture volume of caliscope: the calibration ``source`` with a session's points, and warnings.
+
+    Raises InputError, and Refused where the session does not fit the calibration.
+    """
+    from hub.api import triangulate
+
+    texts, warnings = calibration_files(source, "caliscope", out / "camera_array.toml")
+    rig, cameras = read_calibration(source)
+    found = triangulate(session, source)
+    metric = rig.metadata.get("scale", "metric") != "arbitrary"
+    tables, note = caliscope.point_tables(
+        found.observations,
+        {name: camera.time_map for name, camera in cameras.items() if name not in found.unused},
+        toml_rigs.caliscope_numbers(cameras)[0],
+        found.tables,
+        METRES_PER_UNIT[rig.units] if metric else 1.0,
+    )
+    return texts | {out / name: text for name, text in tables.items()}, (*warnings, *found.warnings, *note)
 
 
 def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
@@ -60,6 +76,3 @@ def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
     write_rig(out / RIG_FILE, rig_tables_of_log(rig))
     write_observations(out / OBSERVATIONS_FILE, observations)
     return len(rig.cameras), len(observations), warnings
-
-
-__all__ = ["IN_FOLDERS", "calibration_files", "export_log", "trajectory_files", "write_c3d"]

@@ -59,9 +59,9 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
             return ImportSource("session", [folder])
         if wanted == "colmap" or (wanted is None and colmap.is_model(folder)):
             return ImportSource("colmap", [folder])
-        volume = folder / "camera_array.toml"
-        if wanted in (None, "caliscope") and volume.exists() and (folder / "image_points.csv").exists():
-            return ImportSource("caliscope", [volume])  # a capture volume
+        volume = {"caliscope": folder / "camera_array.toml", "caliscope-points": folder / "image_points.csv"}
+        if (wanted or "caliscope") in volume and all(file.exists() for file in volume.values()):
+            return ImportSource(wanted or "caliscope", [volume[wanted or "caliscope"]])
         if wanted in (None, "openpose") and keypoints.detect_format(folder) == "openpose":
             return ImportSource("openpose", [folder])
         kinds = (".csv", ".txt", *_YAML, ".toml", *_KEYPOINTS)
@@ -79,7 +79,7 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
     found = {path: _kind_of(path) for path in files}
     unknown = next((path for path, kind in found.items() if kind is None), None)
     if unknown is not None:
-        is_text = unknown.suffix.lower() in (".csv", ".txt", *_YAML)
+        is_text = unknown.suffix.lower() in (".csv", ".txt", ".json", ".toml", *_YAML)
         nearest = points.nearest_layout(_beginning(unknown)) if is_text else ""
         raise InputError(f"unknown format{f': {nearest}' if nearest else ''}", file=unknown, line=1, remedy=_REMEDY)
     kinds_found = sorted({str(kind) for kind in found.values()})

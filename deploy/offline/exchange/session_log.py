@@ -89,6 +89,8 @@ def _objects_file(folder: Path) -> Path | None:
     if not file.exists():
         boxes = folder / BOXES_FILE
         return boxes if boxes.exists() else None
+    if (folder / RIG_FILE).exists() and read_rig(folder / RIG_FILE).bodies:
+        return None  # corners of a board: labelled points
     objects = is_boxes_file(file) or not {"kind", "box_x", "head_u"}.isdisjoint(read_csv_header(file, "observations"))
     return file if objects else None
 
@@ -161,8 +163,7 @@ def rig_tables_of_log(rig: Rig) -> dict[str, Any]:
             table["fps"] = camera.fps
         lens = camera.intrinsics
         if lens is not None:
-            table |= {"matrix": lens.matrix.tolist(), "distortions": lens.distortions.tolist()}
-            table |= {"fisheye": True} if lens.fisheye else {}
+            table |= lens.table()
         if camera.rotation is not None:
             table["rotation"] = so3.log(camera.rotation).tolist()
         for key in ("position", "position_std", "rotation_std"):
@@ -179,6 +180,7 @@ def camera_info(rig: Rig, name: str) -> pb.CameraInfo:
 
     camera = rig.cameras[name]
     info = pb.CameraInfo(schema_version=1, camera=name, boot_id="import", driver="import", clock="device")
+    info.target = str(rig.metadata.get("target", ""))
     info.width, info.height, info.fps = camera.size[0], camera.size[1], camera.fps
     if camera.intrinsics is not None:
         info.matrix.extend(camera.intrinsics.matrix.ravel().tolist())

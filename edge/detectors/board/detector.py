@@ -24,7 +24,8 @@ SEARCH_PX = 1280
 """Longer side [px] of the image in which the whole frame is searched."""
 _TRACK_PX, _TRACK_PX_OF_TAGS = 640, 960  # … in which the surroundings of the last place are searched
 _ENLARGED = 2.0  # at most
-_MARGIN = 1.0  # of the board's extent around its last place
+_MARGIN = 1.0  # of the board's extent around its last place, or around half of its corners
+_NEAR, _NEARLY_ALL = 0.6, 0.9  # the same for chessboards, and around so many of their corners: half as many pixels
 _KEPT_SHARE = 0.8  # fewer of the corners of the last frame: the whole frame is searched
 _TILES = 3  # each way, half an image wide and high: one a frame is searched at full resolution while no board is seen
 _MOST_GROUPS = 4  # of saddle points, searched at each level
@@ -111,8 +112,9 @@ class BoardDetector:
             part = grey[y:bottom, x:right]
             scale = min(longest / max(part.shape), 1.0)
             level = np.asarray(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-            for low, high in linked_saddles(level, max(rows * columns // 2, 4))[:_MOST_GROUPS]:
-                corners = self._search_around(grey, low / scale + [x, y], high / scale + [x, y], box == whole)
+            for low, high, count in linked_saddles(level, max(rows * columns // 2, 4))[:_MOST_GROUPS]:
+                margin = _NEAR if count > _NEARLY_ALL * rows * columns else _MARGIN
+                corners = self._search_around(grey, low / scale + [x, y], high / scale + [x, y], box == whole, margin)
                 if len(corners[0]):
                     return corners
         return NOTHING
@@ -121,16 +123,18 @@ class BoardDetector:
         """The corners around the last place; None if that is not known, or too few are there."""
         if self._last is None:
             return None
-        corners = self._search_around(grey, self._last.min(axis=0), self._last.max(axis=0), False)
+        margin = _NEAR if self._board.kind == "chessboard" else _MARGIN
+        corners = self._search_around(grey, self._last.min(axis=0), self._last.max(axis=0), False, margin)
         return corners if len(corners[0]) >= max(_KEPT_SHARE * len(self._last), 1.0) else None
 
-    def _search_around(self, grey: Grey, low: Floats, high: Floats, thorough: bool) -> Corners:
-        """The corners in the surroundings of a box from low (2,) to high (2,)."""
-        reach = _MARGIN * max(float((high - low).max()), 60.0)
+    def _search_around(self, grey: Grey, low: Floats, high: Floats, thorough: bool, margin: float) -> Corners:
+        """The corners in the surroundings of a box from low (2,) to high (2,). margin: over its longer side."""
+        reach = margin * max(float((high - low).max()), 60.0)
         x, y = np.maximum(np.floor(low - reach), 0).astype(int).tolist()
         right, bottom = np.minimum(np.ceil(high + reach), [grey.shape[1], grey.shape[0]]).astype(int).tolist()
         most = _TRACK_PX if self._board.kind == "chessboard" else _TRACK_PX_OF_TAGS
-        return self._search(grey, (x, y, right, bottom), most, thorough)
+        resolution_kept = (1.0 + 2.0 * margin) / (1.0 + 2.0 * _MARGIN)
+        return self._search(grey, (x, y, right, bottom), round(most * resolution_kept), thorough)
 
     def _search(self, grey: Grey, box: Box, most: int, thorough: bool) -> Corners:
         """The corners in a part of the image, reduced to ``most`` pixels."""
@@ -142,7 +146,8 @@ class BoardDetector:
         size = max(round(part.shape[1] * scale), 1), max(round(part.shape[0] * scale), 1)
         kernel = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
         resized = part if scale == 1.0 else np.asarray(cv2.resize(part, size, interpolation=kernel), dtype=np.uint8)
-        numbers, pixels = self._finder.find(resized, thorough=thorough)
+        cut = x == 0 or y == 0 or right == grey.shape[1] or bottom == grey.shape[0]
+        numbers, pixels = self._finder.find(resized, thorough=thorough, cut=cut)
         full = (pixels + 0.5) * [part.shape[1] / size[0], part.shape[0] / size[1]] - 0.5
         if scale < 1.0:
             numbers, full = self._finder.refine(part, (numbers, full))

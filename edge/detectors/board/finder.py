@@ -17,6 +17,7 @@ Corners = tuple[Ints, Floats]
 NOTHING: Corners = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
 _SUBPIX_LEAST, _SUBPIX_MOST = 2, 9  # px: half window
 _SUBPIX_SHARE, _SUBPIX_SHARE_OF_TAGS = 0.4, 0.12  # of the distance of neighbouring corners; tags are in between
+_LEAST_CUT = 3  # rows and columns of corners of a part of a chessboard, OpenCV's least
 _MOST_CHANGE = 0.4  # of the step between corners to the next: a board seen from 5 squares away, tilted by 60 degrees
 
 
@@ -33,8 +34,11 @@ class Finder:
         self._charuco = _charuco_detector(board) if board.kind == "charuco" else None
         self._tags = _tag_detector(board) if board.tags else None
 
-    def find(self, grey: Grey, *, thorough: bool = False) -> Corners:
-        """The corners in an image (H, W) uint8. thorough: search a chessboard by every method."""
+    def find(self, grey: Grey, *, thorough: bool = False, cut: bool = False) -> Corners:
+        """The corners in an image (H, W) uint8.
+
+        thorough: search a chessboard by every method. cut: it may go on beyond the image's border.
+        """
         if min(grey.shape) < 24:
             return NOTHING
         print_ = np.asarray(255 - grey if self.board.inverted else grey, dtype=np.uint8)
@@ -45,7 +49,11 @@ class Finder:
         elif self._tags is not None:
             numbers, pixels = self._find_tags(print_)
         else:
-            numbers, pixels = self._find_chessboard(print_, thorough)
+            numbers, pixels = self._find_chessboard(print_, False)
+            if cut and not len(numbers) and not self.board.symmetric:
+                numbers, pixels = self._find_cut_chessboard(print_)
+            if thorough and not len(numbers):
+                numbers, pixels = self._find_chessboard(print_, True)
         if self.board.mirrored:
             pixels = np.column_stack([grey.shape[1] - 1.0 - pixels[:, 0], pixels[:, 1]])
             numbers = self._mirrored(numbers)
@@ -59,9 +67,9 @@ class Finder:
         share = _SUBPIX_SHARE if self.board.kind == "chessboard" else _SUBPIX_SHARE_OF_TAGS
         half = int(np.clip(share * self.pitch(corners), _SUBPIX_LEAST, _SUBPIX_MOST))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
-        found = cv2.cornerSubPix(
-            grey, pixels.astype(np.float32).reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria
-        )
+        # Finders extrapolate grids to beyond the image, where OpenCV refuses to begin.
+        begin = np.clip(pixels, 0.0, np.subtract(grey.shape[::-1], 1)).astype(np.float32).reshape(-1, 1, 2)
+        found = cv2.cornerSubPix(grey, begin, (half, half), (-1, -1), criteria)
         refined = np.asarray(found, dtype=np.float64).reshape(-1, 2)
         moved = np.linalg.norm(refined - pixels, axis=1) < 1.5 * half
         return numbers, np.where(moved[:, None], refined, pixels)
@@ -111,7 +119,7 @@ class Finder:
             (classic, cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK),
         ]
         if thorough:
-            methods.append((sector, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY))
+            methods = [(sector, cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)]
         for method, flags in methods:
             found, corners = method(grey, inner, flags=flags)
             if not found or corners is None:
@@ -121,6 +129,34 @@ class Finder:
             pixels = refined.reshape(inner[1], inner[0], 2)
             if _is_regular(pixels):
                 return numbers, _ordered(grey, pixels).reshape(-1, 2)
+        return NOTHING
+
+    def _find_cut_chessboard(self, grey: Grey) -> Corners:
+        """The corners of a chessboard whose other columns, or rows, are beyond the image's border.
+
+        Which part of the board it is follows from the end inside the image: there one more column of squares follows
+        the last corners, and then the margin; and from the colours, which differ at the board's two ends.
+        """
+        assert self.board.squares is not None
+        raw = chessboard_of_any_size(grey, _LEAST_CUT)
+        if raw is None:
+            return NOTHING
+        numbers = np.arange(raw.size // 2)
+        grid = _right_handed(self.refine(grey, (numbers, raw.reshape(-1, 2)))[1].reshape(raw.shape))
+        columns, rows = self.board.squares[0] - 1, self.board.squares[1] - 1
+        whole = np.arange(rows * columns).reshape(rows, columns)
+        for turn in range(4 if _is_regular(grid) else 0):
+            part = np.rot90(grid, turn)
+            hidden = rows - part.shape[0], columns - part.shape[1]
+            if min(hidden) != 0 or max(hidden) == 0:
+                continue
+            axis = int(hidden[1] > 0)
+            lines, of_board = np.moveaxis(part, axis, 0), np.moveaxis(whole, axis, 0)
+            first, other = _diagonal_levels(grey, part)
+            for shift in (0, max(hidden)):
+                if (first <= other) == (shift % 2 == 0) and _ends(grey, lines[::-1] if shift else lines):
+                    seen = of_board[shift : shift + len(lines)]
+                    return np.moveaxis(seen, 0, axis).ravel(), part.reshape(-1, 2)
         return NOTHING
 
     def _mirrored(self, numbers: Ints) -> Ints:
@@ -136,6 +172,15 @@ class Finder:
         return np.asarray(row * (columns - 1) + columns - 2 - column)
 
 
+def chessboard_of_any_size(grey: Grey, least: int) -> Floats | None:
+    """Corners (rows, columns, 2) of a chessboard with at least ``least`` of them each way; None = none is seen."""
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (least, least), flags=flags)
+    if not found or corners is None or meta is None:
+        return None
+    return np.asarray(corners, dtype=np.float64).reshape(*np.asarray(meta).shape[:2], 2)
+
+
 def _is_regular(corners: Floats) -> bool:
     """Whether the steps between corners (rows, columns, 2) change little from one to the next.
 
@@ -148,6 +193,31 @@ def _is_regular(corners: Floats) -> bool:
     return True
 
 
+def _ends(grey: Grey, lines: Floats) -> bool:
+    """Whether a board ends inside the image before the first of lines (n, m, 2) of corners, and not after the last.
+
+    Half a step before the first corners are the last squares, dark and light; from one step on, the margin.
+    """
+    most = np.subtract(grey.shape[::-1], 1)
+    step, beyond = lines[0] - lines[1], 2.0 * lines[-1] - lines[-2]
+    middle, half = 0.5 * (lines[0, :-1] + lines[0, 1:]), 0.5 * (step[:-1] + step[1:])
+    places = [np.rint(middle + far * half).astype(int) for far in (-0.5, 0.5, 1.25)]
+    outside = [((one < 0) | (one > most)).any() for one in (places[2], beyond)]
+    if outside != [False, True]:
+        return False
+    levels = [grey[one[:, 1], one[:, 0]].astype(np.float64) for one in places]
+    inner, last, margin = (float(one[::2].mean() - one[1::2].mean()) for one in levels)
+    light = max(levels[1][::2].mean(), levels[1][1::2].mean()) - 0.25 * abs(inner)
+    is_margin = abs(margin) < 0.25 * abs(inner) and levels[2].mean() > light
+    return bool(is_margin and -last * np.sign(inner) > 0.5 * abs(inner))
+
+
+def _right_handed(corners: Floats) -> Floats:
+    """Corners (rows, columns, 2) in an order in which rows x columns is a right-handed frame in the image."""
+    across, down = corners[0, -1] - corners[0, 0], corners[-1, 0] - corners[0, 0]
+    return corners[:, ::-1] if across[0] * down[1] - across[1] * down[0] < 0.0 else corners
+
+
 def _ordered(grey: Grey, corners: Floats) -> Floats:
     """Corners (rows, columns, 2) of a chessboard in the one order that the same physical corner always has.
 
@@ -155,10 +225,7 @@ def _ordered(grey: Grey, corners: Floats) -> Floats:
     Other boards do not: the first corner is then the one further up and left in the image.
     """
     rows, columns = corners.shape[:2]
-    # The pattern may be found in a mirrored order: rows x columns must form a right-handed frame in the image.
-    across, down = corners[0, -1] - corners[0, 0], corners[-1, 0] - corners[0, 0]
-    if across[0] * down[1] - across[1] * down[0] < 0.0:
-        corners = corners[:, ::-1]
+    corners = _right_handed(corners)  # finders may give a mirrored order
     if (rows + columns) % 2:
         first, other = _diagonal_levels(grey, corners)
         return corners if first <= other else corners[::-1, ::-1]

@@ -29,8 +29,11 @@ _BEND = 0.3  # of the step between corners to the next
 _SHARE = 0.6  # of the second harmonic in the variance on the ring; 0.81 round an ideal corner, seen straight
 
 
-def linked_saddles(grey: npt.NDArray[np.uint8], least: int) -> list[tuple[Floats, Floats]]:
-    """Boxes (low, high; each x, y in px) round groups of at least ``least`` linked corners, the largest first."""
+def linked_saddles(grey: npt.NDArray[np.uint8], least: int) -> list[tuple[Floats, Floats, int]]:
+    """Boxes (low, high; each x, y in px) round groups of at least ``least`` linked corners, the largest first.
+
+    The third value is the number of corners.
+    """
     pixels, phase = _saddles(grey)
     if len(pixels) < least:
         return []
@@ -49,7 +52,7 @@ def linked_saddles(grey: npt.NDArray[np.uint8], least: int) -> list[tuple[Floats
     count, group = connected_components(graph, directed=False)
     sizes = np.bincount(group, minlength=count)
     members = [pixels[group == k] for k in np.argsort(-sizes, kind="stable") if sizes[k] >= least]
-    return [(one.min(axis=0), one.max(axis=0)) for one in members]
+    return [(one.min(axis=0), one.max(axis=0), len(one)) for one in members]
 
 
 def _saddles(grey: npt.NDArray[np.uint8]) -> tuple[Floats, Complexes]:

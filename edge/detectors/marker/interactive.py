@@ -45,7 +45,7 @@ def learn_marker_at(image: npt.NDArray[np.uint8], u: float, v: float) -> tuple[M
     height, width = image.shape[:2]
     column, row = round(u), round(v)
     if not (0 <= column < width and 0 <= row < height):
-        raise InputError("that is not in the picture", remedy="click on the marker")
+        raise InputError("that is not in the picture", remedy="click on the ball")
     smooth = cv2.cvtColor(cv2.medianBlur(image, 5), cv2.COLOR_BGR2LAB)
     mask = np.zeros((height + 2, width + 2), dtype=np.uint8)
     flags = 8 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)

@@ -19,7 +19,8 @@ from edge.detectors.base import Detection, Prediction
 from edge.detectors.moving.association import match_predictions
 from edge.detectors.moving.camera_motion import ImageMotion
 from edge.detectors.moving.foreground import BackgroundSubtractor, SubtractorName
-from edge.detectors.moving.tracklets import ImageTracklet, ShortTermTracker
+from edge.detectors.moving.silhouette_detector import SilhouetteDetector
+from edge.detectors.moving.tracklets import ImageTracklet
 from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
@@ -39,7 +40,7 @@ _FLANK_PX, _FLANK_MOVING_SHARE = 5, 0.25
 _POSITION_STD, _FLOOR_STD = 0.1, 1.0  # over the size, measured on a rendered town seen from above with shadows; px
 
 
-class VehicleDetector:
+class VehicleDetector(SilhouetteDetector):
     """Detects moving vehicles.
 
     model, fps: as for ``PersonDetector``. moving: whether the camera moves; None = to be decided. confirmed_only:
@@ -55,33 +56,16 @@ class VehicleDetector:
         prefix: str = "t",
         moving: bool | None = None,
     ) -> None:
-        self._fps = fps if fps > 0 and math.isfinite(fps) else 25.0
-        self._model: SubtractorName = model
-        self._foreground = BackgroundSubtractor(model, self._fps)
-        self._tracker = ShortTermTracker(prefix, min_displacement=1.0)
-        self._confirmed_only = confirmed_only
+        super().__init__(model, fps, prefix, 1.0, confirmed_only, _MAX_PIXELS)
         self._motion_given = moving
         self._shifts: deque[float] = deque(maxlen=_DECISION_FRAMES)
         self._moving = bool(moving)
         self._compensated = _CompensatedBackground()
-        self._size = (0, 0)
-        self._scale = 1.0
-        self._time = -1.0
-        self._confirmed: set[str] = set()
 
     @property
     def moving(self) -> bool:
         """Whether the camera is assumed to move."""
         return self._moving
-
-    @property
-    def resets(self) -> int:
-        """How often the background model was reset."""
-        return self._foreground.resets
-
-    def is_confirmed(self, label: str) -> bool:
-        """Whether the track of this label was confirmed as a moving vehicle."""
-        return label in self._confirmed
 
     def initialise(self, images: Sequence[Image]) -> None:
         """Learn a fixed camera's background from images over a longer time; no effect for a moving camera."""
@@ -109,10 +93,7 @@ class VehicleDetector:
     ) -> list[Detection]:
         """Vehicles in an image (H, W, 3) BGR taken at ``time_s``; highest score first."""
         self._set_size(image)
-        now = self._time + 1.0 / self._fps if time_s is None else time_s
-        if not now > self._time:
-            now = self._time + 1.0 / self._fps
-        self._time = now
+        now = self._advance(time_s)
         small = self._downscaled(image)
         if self._motion_given is None or self._moving:
             self._decide_camera_motion(small)
@@ -136,18 +117,8 @@ class VehicleDetector:
         return match_predictions(result, predictions)
 
     def _set_size(self, image: Image) -> None:
-        size = image.shape[1], image.shape[0]
-        if size != self._size:
-            self._size = size
-            self._scale = min(1.0, math.sqrt(_MAX_PIXELS / (size[0] * size[1])))
-            self._tracker.clear()
+        if self._resize(image):
             self._compensated = _CompensatedBackground()
-
-    def _downscaled(self, image: Image) -> Image:
-        if self._scale == 1.0:
-            return image
-        size = round(image.shape[1] * self._scale), round(image.shape[0] * self._scale)
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def _decide_camera_motion(self, image: Image) -> None:
         self._compensated.estimate_motion(image)

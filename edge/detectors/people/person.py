@@ -21,7 +21,8 @@ from edge.detectors.moving.association import match_predictions
 from edge.detectors.moving.camera_motion import CameraTravel
 from edge.detectors.moving.foreground import BackgroundSubtractor, ForegroundMasks, SubtractorName
 from edge.detectors.moving.ghosts import is_ghost
-from edge.detectors.moving.tracklets import ImageTracklet, ShortTermTracker
+from edge.detectors.moving.silhouette_detector import SilhouetteDetector
+from edge.detectors.moving.tracklets import ImageTracklet
 from edge.detectors.people.height_model import HeightModel
 from edge.detectors.people.segmentation import segment_people
 from edge.detectors.people.silhouettes import BULK, IsolatedPeople, PersonSilhouette
@@ -47,7 +48,7 @@ class _TrackedSilhouette:
     colour: Floats | None
 
 
-class PersonDetector:
+class PersonDetector(SilhouetteDetector):
     """Detects people before one fixed camera.
 
     model: of the background, mog2 or knn. fps: frame rate where images have no times. confirmed_only: report only
@@ -65,34 +66,16 @@ class PersonDetector:
         prefix: str = "p",
         max_pixels: int = _MAX_PIXELS,
     ) -> None:
-        self._fps = fps if fps > 0 and math.isfinite(fps) else 25.0
-        self._model: SubtractorName = model
-        self._foreground = BackgroundSubtractor(model, self._fps)
+        super().__init__(model, fps, prefix, 0.35, confirmed_only, max_pixels)
         self._travel = CameraTravel()
         self._moving = False
-        self._tracker = ShortTermTracker(prefix, min_displacement=0.35)
-        self._confirmed_only = confirmed_only
-        self._max_pixels = max_pixels
         self._height_model: HeightModel | None = None
-        self._size = (0, 0)
-        self._scale = 1.0
-        self._time = -1.0
-        self._confirmed: set[str] = set()
         self._learns_heights = True  # whether the height model is updated
-
-    @property
-    def resets(self) -> int:
-        """How often the background model was reset because the camera was moved or the light changed suddenly."""
-        return self._foreground.resets
 
     @property
     def moving_share(self) -> float:
         """Share (0..1) of the time in which the camera moved; people are not detected then."""
         return self._travel.share
-
-    def is_confirmed(self, label: str) -> bool:
-        """Whether the track of this label was confirmed: detected several times, and moving."""
-        return label in self._confirmed
 
     def initialise(self, images: Sequence[Image]) -> None:
         """Learn the background from images spread over a longer time, before the first detection."""
@@ -117,10 +100,7 @@ class PersonDetector:
         predictions: of tracked targets in this image; detections that match one carry its id.
         """
         self._set_size(image)
-        now = self._time + 1.0 / self._fps if time_s is None else time_s
-        if not now > self._time:
-            now = self._time + 1.0 / self._fps
-        self._time = now
+        now = self._advance(time_s)
         small = self._downscaled(image)
         if self._travel.moves(small, now):
             self._tracker.clear()
@@ -151,20 +131,8 @@ class PersonDetector:
         return not self._confirmed_only or (one.tracklet.confirmed and fits)
 
     def _set_size(self, image: Image) -> None:
-        size = image.shape[1], image.shape[0]
-        if size == self._size:
-            return
-        self._size = size
-        self._scale = min(1.0, math.sqrt(self._max_pixels / (size[0] * size[1])))
-        small = round(size[0] * self._scale), round(size[1] * self._scale)
-        self._height_model = HeightModel(*small)
-        self._tracker.clear()
-
-    def _downscaled(self, image: Image) -> Image:
-        if self._scale == 1.0:
-            return image
-        size = round(image.shape[1] * self._scale), round(image.shape[0] * self._scale)
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        if self._resize(image):
+            self._height_model = HeightModel(*(round(side * self._scale) for side in self._size))
 
     def _learn_heights(self, predictions: Sequence[Prediction]) -> None:
         """Update the height model from targets tracked by calibrated cameras: this camera need not have seen isolated

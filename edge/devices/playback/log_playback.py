@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, check_size
-from edge.devices.playback.playback_clock import PlaybackClock
+from edge.devices.playback.playback_clock import PlaybackClock, wait_until
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.jpeg import decode_jpeg
@@ -102,11 +102,8 @@ class LogPlayback:
             time_s = self._pending.device_time_ns / NANOSECONDS
             if self._start_s is None:
                 self._start_s = self._playback_clock.now() - time_s
-            wait = self._start_s + time_s - self._playback_clock.now()
-            if wait > timeout_s:
-                self._playback_clock.sleep(timeout_s)
+            if not wait_until(self._playback_clock, self._start_s + time_s, timeout_s):
                 return None
-            self._playback_clock.sleep(wait)
         frame, self._pending = self._pending, next(self._frames, None)
         return frame
 

@@ -20,6 +20,13 @@ class PlaybackClock(Protocol):
         """Return once ``seconds`` have passed on this clock."""
 
 
+def wait_until(clock: PlaybackClock, moment: float, timeout_s: float) -> bool:
+    """Sleep until a moment of the clock [s], at most ``timeout_s``; whether it has come."""
+    wait = moment - clock.now()
+    clock.sleep(min(wait, timeout_s))
+    return wait <= timeout_s
+
+
 class RealTime:
     """The machine's time, counted from ``epoch_unix_s``.
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, Image, check_size
-from edge.devices.playback.playback_clock import PlaybackClock
+from edge.devices.playback.playback_clock import PlaybackClock, wait_until
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -110,11 +110,8 @@ class VideoPlayback:
         if self._playback_clock is not None:
             if self._start_s is None:
                 self._start_s = self._playback_clock.now() - time_s
-            wait = self._start_s + time_s - self._playback_clock.now()
-            if wait > timeout_s:
-                self._playback_clock.sleep(timeout_s)
+            if not wait_until(self._playback_clock, self._start_s + time_s, timeout_s):
                 return None
-            self._playback_clock.sleep(wait)
         frame = Frame(self._pending, round(time_s * NANOSECONDS), self._frame)
         self.repaired += time_s != self._container_time()
         self._time = time_s

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, Image
-from edge.devices.playback.playback_clock import PlaybackClock
+from edge.devices.playback.playback_clock import PlaybackClock, wait_until
 from edge.devices.simulated.aircraft import SimulatedAircraft
 from edge.uav.world.flight_world import FlightWorld
 from protocols.core.clocks import NANOSECONDS
@@ -63,11 +63,8 @@ class FlightCamera:
             if self.ended:
                 return None
         index = self._next
-        wait = self._world.time(index) + _TRANSFER_S - self._playback_clock.now()
-        if wait > timeout_s:
-            self._playback_clock.sleep(timeout_s)
+        if not wait_until(self._playback_clock, self._world.time(index) + _TRANSFER_S, timeout_s):
             return None
-        self._playback_clock.sleep(wait)
         self._next = index + 1
         return Frame(self.render_frame(index), self.device_time_ns(index), index)
 

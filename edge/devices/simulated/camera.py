@@ -9,7 +9,7 @@ import numpy as np
 
 from edge import scenes
 from edge.devices.base import DeviceInfo, Frame
-from edge.devices.playback.playback_clock import PlaybackClock, RealTime
+from edge.devices.playback.playback_clock import PlaybackClock, RealTime, wait_until
 from edge.scenes import renderer_for
 from edge.scenes.common.base import Renderer, SimulatedClock, SimulatedScene
 from edge.scenes.common.rescaling import rescale_scene
@@ -118,11 +118,8 @@ class SimulatedDevice:
         if self._duration_s is not None and self._due - self._start > self._duration_s:
             self._ended = True
             return None
-        wait = self._delivery - self._playback_clock.now()
-        if wait > timeout_s:
-            self._playback_clock.sleep(timeout_s)
+        if not wait_until(self._playback_clock, self._delivery, timeout_s):
             return None
-        self._playback_clock.sleep(wait)
         stamp = self._clock.device_time_ns(self._due)
         stamp += round(self._capture.normal(0.0, self._clock.stamp_noise_s) * NANOSECONDS)
         frame = Frame(

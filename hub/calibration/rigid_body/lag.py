@@ -179,10 +179,7 @@ def _motion_weights(views: ViewPoses) -> Floats:
 
 def quaternions(rotation: Floats) -> Floats:
     """Unit quaternions w, x, y, z (n, 4) of rotations (n, 3, 3)."""
-    vectors = np.array([so3.log(one) for one in rotation]).reshape(-1, 3)
-    angle = np.linalg.norm(vectors, axis=1)
-    axis = vectors / np.maximum(angle, 1e-300)[:, None]
-    return np.column_stack([np.cos(0.5 * angle), np.sin(0.5 * angle)[:, None] * axis])
+    return np.array([so3.quaternion(one) for one in rotation]).reshape(-1, 4)
 
 
 def rotations(turn: Floats) -> Floats:

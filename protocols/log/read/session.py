@@ -46,7 +46,7 @@ def session_from_log(file: Path) -> tuple[Rig, Observations, tuple[str, ...]]:
         rig, observations = builder.build()
     except Refused as refusal:
         raise InputError(
-            f"no session in this log: {refusal.reason}", file=file, remedy="record cameras that see the marker"
+            f"no session in this log: {refusal.reason}", file=file, remedy="record cameras that see what moves"
         ) from None
     damage = (f"the log is damaged: {reader.damage}",) if reader.damage else ()
     return rig, observations, damage + builder.warnings

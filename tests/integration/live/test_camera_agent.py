@@ -115,8 +115,10 @@ def test_pose_and_intrinsics_of_the_rig_file_are_in_the_camera_info() -> None:
         rotation=rotation,
         position_std=np.full(3, 0.01),
     )
-    CameraAgent(ListedDevice([0]), ScriptedDetector(), MemoryBus(hub), "cam0", known=known).run(threading.Event())
+    agent = CameraAgent(ListedDevice([0]), ScriptedDetector(), MemoryBus(hub), "cam0", known=known, target="light")
+    agent.run(threading.Event())
     (info,) = messages(infos)
+    assert info.target == "light"
     assert list(info.position) == [1.0, 2.0, 3.0]
     assert list(info.rotation) == pytest.approx([0.1, -0.2, 0.3])
     assert list(info.position_std) == [0.01, 0.01, 0.01]

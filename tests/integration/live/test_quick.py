@@ -55,7 +55,7 @@ def test_videos_without_a_marker_are_refused_with_a_remedy(tmp_path: Path, capsy
     words = ["quick", "--source", str(folder / "a"), "--source", str(folder / "b"), "--headless"]
     assert run([*words, "--out", str(tmp_path / "out")]) == 3
     captured = capsys.readouterr()
-    assert "has not seen the marker yet" in captured.out
+    assert "has not seen the ball yet" in captured.out
     assert captured.err.count("\n") == 1
 
 

@@ -13,9 +13,10 @@ from protocols.core.errors import EXIT_REFUSED, Refused
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, fit_similarity
 from protocols.geometry.types import Floats
-from protocols.session.calibration import Calibration, read_calibration, write_calibration, write_trajectory
+from protocols.session.calibration import Calibration, read_calibration
 from protocols.session.observations import read_observations
 from tests.support.rigs import Path, Session, random_path, simulate
+from tests.support.written import write_calibration, write_trajectory
 
 
 @dataclass(frozen=True)

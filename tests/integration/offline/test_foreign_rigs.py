@@ -175,6 +175,13 @@ distortion_coefficients: {rows: 1, cols: 4, data: [0.1, 0, 0, 0]}
 projection_matrix: {rows: 3, cols: 4, data: [500, 0, 320, 0, 0, 500, 240, 0, 0, 0, 1, 0]}
 """
 FRAME = '{"people": [{"pose_keypoints_2d": [1, 2, 0.9]}]}'
+JSON = (
+    '{"image_id": 0, "instances": [{"bbox": 1, "keypoints": [[1, 2]]}]}',
+    '{"images": [{"id": 0}], "frames": [{"image_id": 0, "keypoints": [1, 2, 1]}]}',
+    '[{"frame": 0, "points": [{"x": 0.1, "y": 0.2, "z": 0, "visibility": 1}]}]',
+    '[{"cameras": {"a": {"projection_type": "perspective"}}, "views": {"b": {"rotation": [0], "translation": [0]}}}]',
+)
+LENS = "size = [640, 480]\nmatrix = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]\n"
 DAMAGED = {
     "caliscope's xy.csv of 2025, but column keypoint_id is missing": {
         "xy.csv": "sync_index,cam_id,frame_index,frame_time,object_id,img_loc_x,img_loc_y\n0,1,5,0.2,0,1,2\n"
@@ -183,6 +190,30 @@ DAMAGED = {
     "a COLMAP model, but images.txt is missing": {"cameras.txt": "1 PINHOLE 4 4 1 1 1 1\n"},
     "a COLMAP model, but cameras.txt is missing": {"cameras.bin": "", "images.bin": ""},
     "a frame of OpenPose, but key people is missing": {"cam1_000.json": FRAME, "cam1_001.json": "[]"},
+    "caliscope's older xy.csv, but column point_id is missing": {
+        "xy.csv": "sync_index,port,frame_index,frame_time,img_loc_x,img_loc_y\n0,1,5,0.2,1,2\n"
+    },
+    "caliscope's xy.csv of 2025, but column sync_index, img_loc_y is missing": {
+        "xy.csv": "cam_id,frame_index,frame_time,object_id,keypoint_id,img_loc_x\n1,5,0.2,0,1,2\n"
+    },
+    "Syncline's observations.csv, but column time is missing": {"observations.csv": "camera,frame,u,v\ncam0,1,2,3\n"},
+    "MMPose's JSON, but key keypoint_scores is missing": {"cam1.json": JSON[0]},
+    "COCO keypoints, but key annotations is missing": {"cam1.json": JSON[1]},
+    "MediaPipe's export, but key landmarks is missing": {"cam1.json": JSON[2]},
+    "OpenSfM's reconstruction.json, but key shots is missing": {"reconstruction.json": JSON[3]},
+    "aniposelib's calibration, but key matrix is missing": {
+        "calibration.toml": '[cam_0]\nname = "a"\nsize = [4, 3]\ndistortions = [0]\nrotation = [0]\ntranslation = [0]\n'
+    },
+    "caliscope's camera_array.toml, but key cameras is missing": {
+        "camera_array.toml": "cam_id = 1\ndistortions = []\n" + LENS
+    },
+    "Kalibr's camchain, but key intrinsics is missing": {
+        "chain.yaml": "cam0:\n  camera_model: pinhole\n  distortion_model: radtan\n  distortion_coeffs: [0]\n"
+        "  resolution: [4, 3]\n"
+    },
+    "OpenCV's calibration, but key camera_matrix is missing": {
+        "left.yml": "%YAML:1.0\nimage_width: 4\nimage_height: 3\ndistortion_coefficients: [0, 0, 0, 0]\n"
+    },
     "ROS' camera_info, but key distortion_model is missing": {"left.yaml": ROS},
     "ROS' camera_info, but key camera_matrix is missing": {
         "left.yaml": ROS.replace("camera_matrix", "other") + "distortion_model: plumb_bob\n"

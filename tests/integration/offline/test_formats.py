@@ -17,9 +17,11 @@ import tomli_w
 import yaml
 
 from deploy.cli import run
+from protocols.core.names import key_segment
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
+from protocols.log.read.session import load_session
 from protocols.session.calibration import read_calibration
 from protocols.session.folder import read_folder
 from tests.support.videos import numbered_image, write_video
@@ -394,6 +396,23 @@ def test_a_session_becomes_a_log_and_a_session_again(tmp_path: Path) -> None:
     assert run(["export", str(log), "--out", str(again)]) == 2
 
 
+def test_the_corners_of_a_board_pass_through_a_log(tmp_path: Path, capsys: Capture) -> None:
+    session, log = tmp_path / "session", tmp_path / "log.mcap"
+    session.mkdir()
+    bodies = {"board": {str(k): [0.1 * (k % 3), 0.1 * (k // 3), 0.0] for k in range(6)}}
+    cameras = {name: {"name": name, "size": [640, 480], "fps": 10.0} for name in ("CVLab1", "GoPro 2")}
+    rig = {"metadata": {"units": "m", "target": "board", "bodies": bodies}, **cameras}
+    (session / "rig.toml").write_text(tomli_w.dumps(rig))
+    lines = [f"{c},{i},{i / 10},{9 * k + i},{7 * k},{k},corner" for c in cameras for i in range(4) for k in range(6)]
+    (session / "observations.csv").write_text("\n".join(["camera,frame,time,u,v,label,kind", *lines]) + "\n")
+    assert run(["import", str(session), "--out", str(log)]) == 0
+    assert "a log does not store the board" in capsys.readouterr().out
+    read = load_session(log)
+    assert len(read.observations) == len(lines)
+    assert read.rig.metadata["target"] == "board"
+    assert read.observations.cameras == list(cameras)
+
+
 def test_a_log_by_a_calibration_has_the_frames_as_they_happened(tmp_path: Path, capsys: Capture) -> None:
     """left's clock is the reference; right's shows 100 s more and wide's runs twice as fast."""
     rows = {"left": [1.0, 2.0, 3.0], "right": [102.5, 103.5], "wide": [1.0, 9.0]}
@@ -562,6 +581,9 @@ def named_results(named_session: Path) -> Path:
         ("replay log.mcap --through hub --calibration solved/calibration.toml --out OUT.mcap", None),
         ("replay log.mcap --compare log.mcap", None),
         ("info log.mcap", "printed"),
+        ("recover log.mcap --out OUT.mcap", None),
+        ("export solved/calibration.toml --to caliscope --session session --out OUT", "printed"),
+        ("intrinsics videos/Front-left.mp4 --field-of-view 70 --out OUT.toml", None),
         ("report solved --out OUT.html", "OUT.html"),
     ],
 )
@@ -578,6 +600,22 @@ def test_every_other_command_takes_cameras_as_users_name_them(
     if named_in is not None:
         text = printed if named_in == "printed" else (tmp_path / named_in).read_text(encoding="utf-8")
         assert [name for name in NAMED if name not in text] == []
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_agents_are_configured_and_installed_by_the_names_of_users(name: str, tmp_path: Path, capsys: Capture) -> None:
+    file = tmp_path / "agent.toml"
+    file.write_text(f'id = "{name}"\nsite = "yard"\n', encoding="utf-8")
+    assert run(["camera", str(file), "--print-config"]) == 0
+    assert f'id = "{name}"' in capsys.readouterr().out
+    hub = f'id = "hub of {name}"\nnodes = ["{name}"]\n'
+    file.write_text(hub, encoding="utf-8")
+    assert run(["hub", str(file), "--print-config"]) == 0
+    assert f'nodes = ["{name}"]' in capsys.readouterr().out.replace("\n", "").replace("    ", "").replace(",]", "]")
+    file.write_text(f'id = "{name}"\nsite = "yard"\n', encoding="utf-8")
+    assert run(["install", "camera", "--config", str(file), "--root", str(tmp_path), "--dry-run"]) == 0
+    service = f"camera-{key_segment(name).replace('%', '.')}"
+    assert f"/etc/systemd/system/syncline-{service}.service" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("bad", ["../up", "a/b", "cam?", ".hidden", "x" * 64])

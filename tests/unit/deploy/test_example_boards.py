@@ -10,6 +10,7 @@ import pytest
 
 import deploy
 from deploy.agents.assembly import _detector as detector_of
+from deploy.agents.assembly import _target as target_of
 from deploy.agents.assembly import make_device
 from deploy.commands.agents.run import camera
 from deploy.config.agents import CameraConfig
@@ -51,12 +52,17 @@ def test_an_example_is_read_and_its_driver_constructed(
 
 
 @pytest.mark.parametrize(
-    ("mode", "kind"), [("colour", MarkerDetector), ("bright", BrightDetector), ("tag", TagDetector)]
+    ("mode", "kind", "target"),
+    [("colour", MarkerDetector, "ball"), ("bright", BrightDetector, "light"), ("tag", TagDetector, "tag")],
 )
-def test_the_markers_mode_chooses_its_detector(mode: str, kind: type, tmp_path: Path) -> None:
+def test_the_markers_mode_chooses_its_detector(mode: str, kind: type, target: str, tmp_path: Path) -> None:
     file = tmp_path / "cam.toml"
     file.write_text(f'id = "a"\n[marker]\nmode = "{mode}"\n')
-    assert isinstance(detector_of(load(file, CameraConfig), None, 30.0), kind)
+    config = load(file, CameraConfig)
+    assert isinstance(detector_of(config, None, 30.0), kind)
+    assert target_of(config) == target
+    file.write_text('id = "a"\ndetector = "person"\n')
+    assert target_of(load(file, CameraConfig)) == "person"
 
 
 @pytest.mark.parametrize(

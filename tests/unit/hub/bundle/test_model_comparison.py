@@ -10,9 +10,10 @@ import pytest
 
 from hub.calibration.pipeline import calibrate
 from protocols.core.errors import InputError
-from protocols.session.calibration import Calibration, read_calibration, write_calibration
+from protocols.session.calibration import Calibration, read_calibration
 from protocols.session.rig import RigCamera, read_rig
 from tests.support import rigs
+from tests.support.written import write_calibration
 
 SEED = 7310
 READOUTS = (0.025, 0.0, 0.03, 0.015)

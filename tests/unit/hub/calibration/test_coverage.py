@@ -1,4 +1,4 @@
-"""Image coverage of the marker and the advice derived from it."""
+"""Image coverage of the target and the advice derived from it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from hub.calibration.coverage import (
     session_advice,
     uncovered_regions,
 )
+from hub.report import build_report
 from hub.report.measures import COLUMNS, ROWS
+from protocols.core.errors import Refused
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.observations import gather_tracks
+from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
 from tests.support.samples import camera_info, observation
 
@@ -92,6 +94,39 @@ def test_uncovered_sides_are_named(rows: slice, columns: slice, regions: tuple[s
     covered = np.zeros((ROWS, COLUMNS), dtype=bool)
     covered[rows, columns] = True
     assert uncovered_regions(covered) == regions
+
+
+@pytest.mark.parametrize(
+    ("target", "instruction", "unseen"),
+    [
+        ("ball", "wave the ball", "cam0 has not seen the ball yet: wave it in front of it"),
+        ("light", "move the light", "cam0 has not seen the light yet: move it in front of it"),
+        ("tag", "show the tag", "cam0 has not seen the tag yet: show it in front of it"),
+        ("person", "walk about", "cam0 has not seen the person yet: walk in front of it"),
+        ("vehicle", "drive about", "cam0 has not seen the vehicle yet: drive in front of it"),
+        ("", "move the target", "cam0 has not seen the target yet: move it in front of it"),
+    ],
+)
+def test_live_advice_names_what_the_cameras_look_for(target: str, instruction: str, unseen: str) -> None:
+    guidance = CoverageMonitor()
+    info = camera_info("cam0")
+    info.target = target
+    guidance.handle(info)
+    guidance.handle(pb.Observation(schema_version=1, camera="cam0", boot_id="b", sequence=0))
+    assert guidance.instruction() == instruction
+    assert [advice.text for advice in guidance.advice()] == [unseen]
+
+
+@pytest.mark.parametrize(
+    ("target", "word"), [("board", "board"), ("light", "light"), ("person", "person"), ("ball", "ball"), ("", "point")]
+)
+def test_reports_speak_of_what_the_user_moves(target: str, word: str) -> None:
+    cameras = {name: RigCamera(name, (640, 480), 30.0) for name in ("cam0", "cam1")}
+    rig = Rig(cameras, metadata={"target": target} if target else {})
+    reason = "the point hardly moves while both could have seen it"
+    page = build_report(Refused("no pair could be synchronised", {"cam0": reason}), rig, Observations({}))
+    assert f"ove the {word}: record longer while the {word} moves fast" in page
+    assert ("the point" in page) == (word == "point")
 
 
 def test_a_reset_clears_the_counts_but_not_the_cameras() -> None:

@@ -134,7 +134,7 @@ def test_the_fundamental_matrix_has_the_published_convention() -> None:
 def test_the_tangent_basis_is_orthonormal(seed: int) -> None:
     direction = np.random.default_rng(seed).normal(size=3)
     direction /= np.linalg.norm(direction)
-    basis = np.column_stack([direction, relative_pose.tangent_basis(direction)])
+    basis = np.column_stack([direction, relative_pose.orthogonal_axes(direction).T])
     np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-14)
 
 

@@ -302,4 +302,4 @@ def test_an_empty_site_says_what_to_do() -> None:
     state.handle(camera_info("cam0"), 0.0)
     state.handle(observation("cam0", points=0), 0.0)
     assert "syncline camera" not in overview(state, 0.0)
-    assert "cam0 has not seen the marker yet: wave it in front of it" in overview(state, 0.0)
+    assert "cam0 has not seen the target yet: move it in front of it" in overview(state, 0.0)

@@ -82,11 +82,14 @@ def test_the_panel_shows_the_figures_of_the_hub() -> None:
     assert f"{found.rms_px:.2f} px" in text
     assert "25.0" in text
     assert "✓ cam0" in text
-    assert "50 frames, marker in 50" in camera_details(state, state.cameras["cam0"], now)
+    assert "50 frames, target in 50" in camera_details(state, state.cameras["cam0"], now)
 
 
 def test_names_and_reasons_cannot_put_markup_into_the_page() -> None:
     state = ViewState()
+    info = camera_info("cam0")
+    info.target = "<img src=x onerror='alert(3)'>"
+    state.handle(info, 0.0)
     filming(state)
     bad = pb.Calibration(schema_version=1, status="refused", reason="<script>alert(1)</script>")
     bad.refused.append(pb.Refusal(camera="cam0", reason="<img src=x onerror='alert(2)'>\"'"))
@@ -99,9 +102,13 @@ def test_names_and_reasons_cannot_put_markup_into_the_page() -> None:
 
 def test_guidance_is_shown_while_something_is_missing() -> None:
     state = ViewState()
-    state.handle(camera_info("cam0"), 0.0)
+    info = camera_info("cam0")
+    info.target = "ball"
+    state.handle(info, 0.0)
     filming(state)
+    assert "cam0 has seen the ball in" in overview(state, 2.0)
     assert "of its view: wave it" in overview(state, 2.0)
+    assert ", ball in" in camera_details(state, state.cameras["cam0"], 2.0)
 
 
 def test_while_nothing_is_solved_the_page_says_what_each_camera_is_waited_for() -> None:
@@ -114,7 +121,7 @@ def test_while_nothing_is_solved_the_page_says_what_each_camera_is_waited_for() 
     state.handle(waiting, 2.0)
     text = overview(state, 2.0)
     assert "<p data-waiting='cam0'>… cam0 <progress" in text
-    assert "collecting: 50 of 90 detections · 4 s of motion shared with another camera · marker seen in" in text
+    assert "collecting: 50 of 90 detections · 4 s of motion shared with another camera · target seen in" in text
     assert "class='bad'" not in text + camera_table(state, 2.0), "nobody has to act yet"
     state.handle(pb.Calibration(schema_version=1, status="solved", state="calibrated"), 3.0)
     assert "data-waiting" not in overview(state, 3.0)

@@ -21,10 +21,9 @@ from protocols.session.calibration import (
     CameraCalibration,
     TrajectoryTable,
     read_calibration,
-    write_calibration,
-    write_trajectory,
 )
 from protocols.session.rig import Rig, read_rig
+from tests.support.written import write_calibration, write_trajectory
 
 RIG = """
 [cam0]

@@ -10,8 +10,9 @@ import pytest
 
 from protocols.core.errors import InputError
 from protocols.session.calibration import calibration_tables
-from protocols.session.result import refusal_document, result_document, result_text, write_result
+from protocols.session.result import refusal_document, result_document, result_text
 from tests.support.solved_session import solved_session
+from tests.support.written import write_result
 
 
 def test_every_figure_of_calibration_toml_is_in_it_unchanged() -> None:
