@@ -82,7 +82,7 @@ def test_warnings_name_the_videos_that_cannot_be_used(recorded: RecordedVideos) 
     warnings = "\n".join(result["warnings"])
     assert "copy of cam0.mp4 is the same video as cam0.mp4" in warnings
     assert "broken.mp4: no frame can be read" in warnings
-    assert "wall.mp4: no marker" in warnings
+    assert "wall.mp4: no ball" in warnings
     assert toml(recorded.out / "calibration.toml")["metadata"]["refused"]["wall"] == "no observations"
 
 
