@@ -14,7 +14,7 @@ import numpy as np
 
 from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
 from edge.uav.correlation.belief import Belief
-from edge.uav.correlation.candidate import Kinematics
+from edge.uav.correlation.candidate import Kinematics, motion_ratio
 from edge.uav.correlation.filter import CorrelationFilter, Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -33,6 +33,7 @@ _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
+_PLACE_STD = 0.05  # of a measured place, in target lengths
 _WINDOW = 1.2  # half of the region that the filter sees, in target lengths
 _MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
 _UNKNOWN_STEP = 0.1  # std of a step of the scene that could not be measured, over the image's width
@@ -92,6 +93,7 @@ class AppearanceTracker:
         self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
         self._expected: Estimate | None = None
         self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
+        self._stands = self.box.centre  # where that would be if it stood since
         self._other_std = np.inf
         self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
         self._belief = Belief()
@@ -163,7 +165,7 @@ class AppearanceTracker:
                 moving.follow_scene(motion.matrix[:, :2])
             if self._missed == 0:
                 box = motion.moved(box)
-            sure = motion.moved(sure)
+            sure, self._stands = motion.moved(sure), motion.at(self._stands, self._scene.reach)
             self._redetection.move(motion, self._scene.reach, dt)
         elif expected is None and (self._missed or self._time - self._trusted_at < _FAST_PAN_S):
             for moving in (self._motion_filter, velocity):
@@ -205,7 +207,7 @@ class AppearanceTracker:
             if self.follows:
                 self.box, self._other_std = box, expected.std
             if not self.motion.trusted:
-                self._sure = self.box, copy(self._motion_filter)
+                self._sure, self._stands = (self.box, copy(self._motion_filter)), self.box.centre
 
     def _relocated(self) -> OrientedBox | None:
         """The target's prediction from where it was last seen, in the scene that is now recognised."""
@@ -230,7 +232,7 @@ class AppearanceTracker:
             return
         box, answer = self._respond(image, self.box)
         score, peak = self._memory.score(image, box), answer.peak
-        ratio = self._ratio = self._memory.tracking_ratio(score) + answer.log_ratio
+        ratio = self._ratio = self._memory.tracking_ratio(score) + answer.log_ratio + self._moves(box)
         if self._support is not None and np.hypot(*(box.centre - self._support)) < _SUPPORT_WITHIN * self.length:
             ratio += _SUPPORT
         # It can only be there if it is in the filter's window at all.
@@ -246,6 +248,12 @@ class AppearanceTracker:
             self._observe_background(image, box)
         elif not self.certain and self._frame % _OBSERVE_DOUBTFUL_EVERY == 0:
             self._observe_rivals(image, box)
+
+    def _moves(self, box: OrientedBox) -> float:
+        """log p(place | on the target) - log p(place | slipped on to the scene), by how it went on since it was sure."""
+        sure, velocity = self._sure
+        std = float(np.hypot(velocity.std, _PLACE_STD * self.length))
+        return motion_ratio(box.centre - self._stands, sure.centre - self._stands, std)
 
     def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
@@ -273,7 +281,7 @@ class AppearanceTracker:
                 self._since_keyframe = np.eye(3)
             self._last_sight = box, self._motion_filter.velocity
             if self.certain and self._belief.log_odds > _CERTAIN:
-                self._sure = box, copy(self._motion_filter)
+                self._sure, self._stands = (box, copy(self._motion_filter)), box.centre
         self.box = box
         self._flow.remember(image, box)
 
@@ -288,7 +296,7 @@ class AppearanceTracker:
         return moved, answer
 
     def _learn(self, image: Image, box: OrientedBox, score: float, peak: float) -> None:
-        self._filter.learn(image, box, self._memory.agrees(self._memory.first_score(image, box)))
+        self._filter.learn(image, box, self._memory.agrees(float(self._memory.first_scores(image, [box])[0])))
         if self._frame % 2 == 0:
             self._scale.learn(image, box)
         self._memory.confirm(score)
@@ -306,9 +314,9 @@ class AppearanceTracker:
         shaped = box.sized(self._first * area)
         trials = [box.turned(-box.angle), shaped, shaped.turned(-box.angle)]
         trials += [box.sized(box.sides * factor) for factor in _TRIAL_SIZES]
-        gains = [self._memory.first_score(image, trial) for trial in trials]
+        now, *gains = self._memory.first_scores(image, [box, *trials])
         best = int(np.argmax(gains))
-        if gains[best] < self._memory.first_score(image, box) + _ANCHOR_GAIN:
+        if gains[best] < now + _ANCHOR_GAIN:
             return box
         aim = trials[best]
         sides = box.sides * (aim.sides / box.sides) ** _ANCHOR_STEP
