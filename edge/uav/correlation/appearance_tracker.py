@@ -14,7 +14,7 @@ import numpy as np
 
 from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
 from edge.uav.correlation.belief import Belief
-from edge.uav.correlation.candidate import Kinematics, motion_ratio
+from edge.uav.correlation.candidate import Kinematics
 from edge.uav.correlation.filter import CorrelationFilter, Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -23,6 +23,7 @@ from edge.uav.correlation.scale import BoxFlow, ScaleFilter
 from edge.uav.correlation.search import search, tile
 from edge.uav.correlation.shape import Outline
 from edge.uav.correlation.velocity import VelocityFilter
+from edge.uav.image_motion.residual import MovingParts, Residual
 from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
 from edge.uav.target.box import check_target_box
 from protocols.geometry.types import Floats
@@ -33,7 +34,8 @@ _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
-_PLACE_STD = 0.05  # of a measured place, in target lengths
+_MOVED = 2.0  # distance within which what moves is looked for, in target lengths
+_STANDS = -0.3  # log likelihood ratio below which a place stands and the target moves
 _WINDOW = 1.2  # half of the region that the filter sees, in target lengths
 _MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
 _UNKNOWN_STEP = 0.1  # std of a step of the scene that could not be measured, over the image's width
@@ -93,11 +95,12 @@ class AppearanceTracker:
         self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
         self._expected: Estimate | None = None
         self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
-        self._stands = self.box.centre  # where that would be if it stood since
         self._other_std = np.inf
         self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
         self._belief = Belief()
         self._searching = False
+        self._parts = MovingParts()
+        self._parts.update(image, self._time, self.box, STILL, self.box.centre, self.box.centre)
         return self._estimate(time)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
@@ -114,10 +117,12 @@ class AppearanceTracker:
             self._miss(dt)
             return self._estimate(time)
         self.motion = self._scene.update(image, self._outline() if self._missed == 0 else None)
+        place = self.box.centre
         origin = self._predict(dt)
+        self._parts.update(image, self._time, self.box, self.motion, place, origin)
         self.debug = {}
         if not self._searching:
-            self._track(image, origin, dt)
+            self._track(image, dt)
         else:
             self._look_for(image, dt)
         return self._estimate(time)
@@ -165,7 +170,7 @@ class AppearanceTracker:
                 moving.follow_scene(motion.matrix[:, :2])
             if self._missed == 0:
                 box = motion.moved(box)
-            sure, self._stands = motion.moved(sure), motion.at(self._stands, self._scene.reach)
+            sure = motion.moved(sure)
             self._redetection.move(motion, self._scene.reach, dt)
         elif expected is None and (self._missed or self._time - self._trusted_at < _FAST_PAN_S):
             for moving in (self._motion_filter, velocity):
@@ -207,7 +212,7 @@ class AppearanceTracker:
             if self.follows:
                 self.box, self._other_std = box, expected.std
             if not self.motion.trusted:
-                self._sure, self._stands = (self.box, copy(self._motion_filter)), self.box.centre
+                self._sure = self.box, copy(self._motion_filter)
 
     def _relocated(self) -> OrientedBox | None:
         """The target's prediction from where it was last seen, in the scene that is now recognised."""
@@ -224,15 +229,23 @@ class AppearanceTracker:
         turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
         return moved.sized(seen.sides * zoom).turned(turn)
 
-    def _track(self, image: Image, origin: Floats, dt: float) -> None:
+    def _track(self, image: Image, dt: float) -> None:
         """Measure the target about its prediction."""
         if self.box.share_inside(self._size) < _MEASURE_INSIDE:
             self._searching = True  # it leaves the image
             self._miss(dt)
             return
-        box, answer = self._respond(image, self.box)
-        score, peak = self._memory.score(image, box), answer.peak
-        ratio = self._ratio = self._memory.tracking_ratio(score) + answer.log_ratio + self._moves(box)
+        residual = self._parts.residual(image, self._time, self.box, _MOVED * self.length)
+        box, answer, score, ratio = self._measured(image, self.box, residual)
+        if residual.log_ratio(box.centre) < _STANDS:
+            # It moved, and what is here stands: what moves beside it may be the target.
+            for place in residual.peaks(box.extent, 1):
+                other = self._measured(image, box.at(place), residual)
+                if other[3] > ratio + _SUPPORT:
+                    box, answer, score, ratio = other
+        self._ratio, peak = ratio, answer.peak
+        if self.certain:
+            self._parts.confirm(residual, box.centre)
         if self._support is not None and np.hypot(*(box.centre - self._support)) < _SUPPORT_WITHIN * self.length:
             ratio += _SUPPORT
         # It can only be there if it is in the filter's window at all.
@@ -249,11 +262,14 @@ class AppearanceTracker:
         elif not self.certain and self._frame % _OBSERVE_DOUBTFUL_EVERY == 0:
             self._observe_rivals(image, box)
 
-    def _moves(self, box: OrientedBox) -> float:
-        """log p(place | on the target) - log p(place | slipped on to the scene), by how it went on since it was sure."""
-        sure, velocity = self._sure
-        std = float(np.hypot(velocity.std, _PLACE_STD * self.length))
-        return motion_ratio(box.centre - self._stands, sure.centre - self._stands, std)
+    def _measured(
+        self, image: Image, box: OrientedBox, residual: Residual
+    ) -> tuple[OrientedBox, Response, float, float]:
+        """The target about a box: where, the filter's answer, its similarity, and the log likelihood ratio of it all."""
+        box, answer = self._respond(image, box)
+        score = self._memory.score(image, box)
+        ratio = self._memory.tracking_ratio(score) + answer.log_ratio + residual.log_ratio(box.centre)
+        return box, answer, score, ratio
 
     def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
@@ -281,7 +297,7 @@ class AppearanceTracker:
                 self._since_keyframe = np.eye(3)
             self._last_sight = box, self._motion_filter.velocity
             if self.certain and self._belief.log_odds > _CERTAIN:
-                self._sure, self._stands = (box, copy(self._motion_filter)), box.centre
+                self._sure = box, copy(self._motion_filter)
         self.box = box
         self._flow.remember(image, box)
 
@@ -354,7 +370,9 @@ class AppearanceTracker:
         """Search for the target where it can be."""
         self._missed += 1
         self._unseen_s += dt
-        found = self._redetection.look(image, self._prediction(), dt)
+        expected = self._prediction()
+        residual = self._parts.residual(image, self._time, self.box, 2.0 * expected.wide + self.length)
+        found = self._redetection.look(image, expected, dt, residual)
         self.debug = self._redetection.debug
         if found is not None:
             self._missed, self._unseen_s, self._searching = 0, 0.0, False

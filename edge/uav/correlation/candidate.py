@@ -16,8 +16,6 @@ _MAX_TESTS = 8  # frames for which a place is tested
 _HITS = 3  # consecutive frames of a re-detection
 _PLACE_STD = 0.05  # of a place measured twice, in target lengths
 KEEPS, _TURNS, _STOPS = 0.75, 0.15, 0.1  # probabilities of what a target has done while away
-_SLIPPED_AT = (0.0, 0.25, 0.5, 0.75)  # share of the way after which a box slips off a moving target on to the scene
-_MOVES_LIMIT = 1.0  # log likelihood ratio: a box follows its own prediction where nothing else draws it
 _STOOD = 0.3  # speed below which it stood and may go on to, in lengths a second
 _STILL, _STILL_STD = 0.5, 0.1  # share of the look-alikes that stand, and std of their speed, in lengths a second
 _SLOWEST = 0.35  # std of the velocity of what moves, at least, one coordinate, in lengths a second
@@ -43,16 +41,6 @@ class Kinematics:
         stood = 0.5 * KEEPS * np.exp(-0.5 * np.square(self.velocity).sum() / (_STOOD * self.length) ** 2)
         target = (KEEPS - stood) * keeps + _TURNS * moves + (_STOPS + stood) * stands
         return float(np.log(target + 1e-300) - np.log(_STILL * stands + (1.0 - _STILL) * moves + 1e-300))
-
-
-def motion_ratio(moved: Floats, expected: Floats, std: float) -> float:
-    """log p(moved | target) - log p(moved | slipped on to the scene at some time), bounded above.
-
-    moved, expected: (2,) over the scene since the target was surely there; std: of both, one coordinate [px].
-    """
-    on = _normal(moved - expected, std) + 1e-300
-    slipped = float(np.mean([_normal(moved - share * expected, std) for share in _SLIPPED_AT])) + 1e-300
-    return float(min(np.log((1.0 - _STOPS) * on + _STOPS * slipped) - np.log(slipped), _MOVES_LIMIT))
 
 
 def _normal(deviation: Floats, std: float) -> float:

@@ -12,7 +12,8 @@ from edge.uav.correlation.candidate import KEEPS, Candidate, Kinematics
 from edge.uav.correlation.filter import Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
-from edge.uav.correlation.search import search, tile
+from edge.uav.correlation.search import Found, search, tile
+from edge.uav.image_motion.residual import UNKNOWN, Residual
 from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats
 
@@ -23,6 +24,7 @@ _PROPOSED = 1.0  # log prior of a place that another tracker has found
 _PROMISING = 0.0  # log odds of a place under test above which others are searched about the prediction only
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
 _MOST_TESTED, _RIVAL_MARGIN = 2, 2.0  # places that are tested at once; log odds within which one is a rival
+_MOST_MOVING = 2  # places at which something moves that are looked at, a search
 _DETECTION = 0.25  # probability that one search finds a target in view
 _HIDDEN = 0.1  # probability that it is in view, but behind something, for as long as it is away
 _CHANGE = 0.1  # std of the similarity of a target that has been away
@@ -61,6 +63,7 @@ class Redetection:
         self._near = 1.0
         self._inside, self._unnoticed = 0.0, 1.0  # probability that it is in the image, and that it was not seen there
         self._tested: list[Candidate] = []
+        self._moving = UNKNOWN
         self.debug: dict[str, float] = {}
 
     def move(self, motion: Motion, reach: float, dt: float) -> None:
@@ -77,9 +80,9 @@ class Redetection:
         if not same:
             self._tested.append(Candidate(box, prior, expected.motion))
 
-    def look(self, image: Image, expected: Prediction, dt: float) -> Candidate | None:
+    def look(self, image: Image, expected: Prediction, dt: float, moving: Residual = UNKNOWN) -> Candidate | None:
         """Search one image; the place that is taken for the target, if any: by its odds, and a margin over the next."""
-        self.debug = {}
+        self.debug, self._moving = {}, moving
         self._tested = [c for c in self._tested if self._test(image, c, expected, dt)]
         if not self._tested or self._tested[0].log_odds < _PROMISING or expected.frames % 2 == 0:
             self._search(image, expected, dt)
@@ -102,11 +105,17 @@ class Redetection:
             box, reach = tile(box, self._size, turn)
         else:
             self._find_nothing(expected)
-        new = [f for f in search(image, self._memory, box, reach) if not any(c.covers(f.box) for c in self._tested)]
+        found = search(image, self._memory, box, reach)
+        moving = [box.at(place) for place in self._moving.peaks(box.extent, _MOST_MOVING)]
+        found += [Found(place, self._memory.score(image, place)) for place in moving]
+        new = [f for f in found if not any(c.covers(f.box) for c in self._tested)]
         if not new:
             return
         priors = [self._log_prior(f.box.centre, expected) for f in new]
-        odds = [self._memory.log_ratio(f.score, _CHANGE) + prior for f, prior in zip(new, priors, strict=True)]
+        odds = [
+            self._memory.log_ratio(f.score, _CHANGE) + prior + self._moving.log_ratio(f.box.centre)
+            for f, prior in zip(new, priors, strict=True)
+        ]
         order = np.argsort(odds)[::-1]
         for k in order[:_MOST_TESTED]:
             # A rival that is about as likely is tested beside the likeliest one.
@@ -149,6 +158,7 @@ class Redetection:
         scores = self._memory.scores(image, trials)
         score, box = float(scores.max()), trials[int(scores.argmax())]
         evidence = self._memory.log_ratio(score, _CHANGE, answer.log_ratio)
+        evidence += self._moving.log_ratio(box.centre)
         candidate.add(box, evidence, dt)
         self.debug |= {"score": score, "llr": evidence, "ratio": answer.ratio, "prior": candidate.prior}
         return candidate.promising and box.share_inside(self._size) > _MIN_INSIDE

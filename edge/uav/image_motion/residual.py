@@ -1,0 +1,142 @@
+"""What moves over the static scene: the residual of the stabilised image, for a target too small to be told by its look.
+
+Differences to two earlier images, stabilised on the scene; the smaller one counts, so that nothing is left where a
+moving thing was before. A pixel may be any value that its neighbours in the earlier image span: errors of a pixel in
+the stabilisation leave nothing either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from edge.uav.base import Image
+from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.image_motion.scene_motion import Motion
+from protocols.geometry.types import Floats
+
+_APART_S = 0.35  # between the images that are compared
+_KEEP_S = 0.08  # between two that are kept
+_SIDE_PX = 14.0  # geometric mean of the target's sides in the reduced image, at least
+_MAX_PX = 140  # side of the region that is searched [px, reduced]
+# Of the log ratio in rendered flights: what moves by 2 px or more (mean, std of what is below), what stands; share of
+# the places beside a target where something else moves.
+_MOVING, _STANDING_STD, _OTHERS = (2.0, 0.7), 0.25, 0.08
+_SURELY = 3.0  # ratio of what moves
+_BOUNDS = (0.1, 0.9)  # of the probability that the target moves
+_LEARNING = 0.1  # share of a new observation of whether the target moves
+_FLOOR = 1.5  # grey levels of difference that noise and compression leave
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residual:
+    """ratio: (h, w) of the mean difference in boxes about each pixel to the median one; 0 where it is not known.
+
+    scale, low: of its pixels. moves: probability that the target moves over the scene.
+    """
+
+    ratio: npt.NDArray[np.float32]
+    scale: float
+    low: Floats
+    moves: float
+
+    def densities(self, place: Floats) -> tuple[float, float]:
+        """Densities of the log ratio at a place (2,), for what moves and for what stands; equal where not known."""
+        x, y = np.rint((place - self.low) / self.scale).astype(int)
+        inside = 1 <= y < len(self.ratio) - 1 and 1 <= x < self.ratio.shape[1] - 1
+        ratio = float(self.ratio[y - 1 : y + 2, x - 1 : x + 2].max()) if inside else 0.0
+        if ratio == 0.0:
+            return 1.0, 1.0
+        value = max(float(np.log(ratio)), 0.0)
+        moving = np.exp(-0.5 * (min(value - _MOVING[0], 0.0) / _MOVING[1]) ** 2) / (2.5 * _MOVING[1])
+        standing = 2.0 * np.exp(-0.5 * (value / _STANDING_STD) ** 2) / (2.5 * _STANDING_STD)
+        return float(moving), float((1.0 - _OTHERS) * standing + _OTHERS * moving + 1e-3)
+
+    def log_ratio(self, place: Floats) -> float:
+        """log p(residual | target) - log p(residual | anything else) at a place (2,) [px], natural."""
+        moving, standing = self.densities(place)
+        return float(np.log(self.moves * moving + (1.0 - self.moves) * standing) - np.log(standing))
+
+    def peaks(self, apart: Floats, most: int) -> list[Floats]:
+        """Places (2,) of what surely moves, ``apart`` (2,) from each other [px], the highest ratio first."""
+        left, out = self.ratio.copy(), []
+        for _ in range(most):
+            y, x = divmod(int(left.argmax()), left.shape[1])
+            if left[y, x] < _SURELY:
+                break
+            out.append(self.low + self.scale * np.array([x, y]))
+            dx, dy = np.maximum(apart / self.scale, 1.0).astype(int)
+            left[max(y - dy, 0) : y + dy + 1, max(x - dx, 0) : x + dx + 1] = 0.0
+        return out
+
+
+UNKNOWN = Residual(np.zeros((1, 1), np.float32), 1.0, np.zeros(2), 0.0)
+
+
+class MovingParts:
+    """Images of the last second, with the scene's motion since; about the place for which that was measured."""
+
+    def __init__(self) -> None:
+        self._moves = 0.5
+        self._reduction = 1
+        self._past: list[tuple[float, Image, Floats]] = []
+
+    def update(self, image: Image, time: float, box: OrientedBox, motion: Motion, place: Floats, origin: Floats) -> None:
+        """Add an image. box: of the target; the scene at ``place`` (2,) is now at ``origin`` (2,)."""
+        reduction = max(int(np.sqrt(box.width * box.height) / _SIDE_PX), 1)
+        if not motion.trusted or not 0.5 < reduction / self._reduction < 2.0:
+            self._past, self._reduction = [], reduction
+        step = np.eye(3)
+        step[:2] = motion.matrix
+        step[:2, 2] += origin - (motion.matrix[:, :2] @ place + motion.matrix[:, 2])
+        self._past = [(t, old, step @ since) for t, old, since in self._past if time - t < 2.0 * _APART_S + _KEEP_S]
+        if not self._past or time - self._past[-1][0] > _KEEP_S:
+            size = (image.shape[1] // self._reduction, image.shape[0] // self._reduction)
+            small = image if self._reduction == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            self._past.append((time, np.asarray(small, np.uint8), np.eye(3)))
+
+    def residual(self, image: Image, time: float, box: OrientedBox, reach: float) -> Residual:
+        """About a box, for centres within ``reach`` [px]; unknown before there are images to compare with."""
+        if not self._past or time - self._past[0][0] < 1.5 * _APART_S:
+            return UNKNOWN
+        scale = float(self._reduction)
+        rows, columns = self._past[0][1].shape[:2]
+        half = np.minimum((reach + 0.5 * box.extent) / scale, 0.5 * _MAX_PX)
+        centre = (box.centre + 0.5) / scale - 0.5
+        low = np.clip(np.floor(centre - half), 0, [columns - 1, rows - 1]).astype(int)
+        high = np.clip(np.ceil(centre + half) + 1, 0, [columns, rows]).astype(int)
+        window = (int(high[0] - low[0]), int(high[1] - low[1]))
+        if min(window) < 8:
+            return UNKNOWN
+        x0, y0 = int(low[0]), int(low[1])
+        region = image[y0 * self._reduction : high[1] * self._reduction, x0 * self._reduction : high[0] * self._reduction]
+        new = region if scale == 1.0 else cv2.resize(region, window, interpolation=cv2.INTER_AREA)
+        full = np.array([[scale, 0.0, 0.5 * (scale - 1.0)], [0.0, scale, 0.5 * (scale - 1.0)], [0.0, 0.0, 1.0]])
+        shift = np.array([[1.0, 0.0, x0], [0.0, 1.0, y0], [0.0, 0.0, 1.0]])
+        least, seen = np.full(window[::-1], 255, np.uint8), np.full(window[::-1], 255, np.uint8)
+        for age in (_APART_S, 2.0 * _APART_S):
+            _, old, since = min(self._past, key=lambda kept: abs(time - kept[0] - age))
+            inverse = (np.linalg.inv(full) @ np.linalg.inv(since) @ full @ shift)[:2]
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            before = cv2.warpAffine(old, inverse, window, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+            known = cv2.warpAffine(np.full(old.shape[:2], 255, np.uint8), inverse, window, flags=flags)
+            kernel = np.ones((3, 3), np.uint8)
+            above = cv2.subtract(new, cv2.dilate(before, kernel))
+            below = cv2.subtract(cv2.erode(before, kernel), new)
+            difference = np.maximum(above, below).max(axis=2)
+            least, seen = np.minimum(least, difference), np.minimum(seen, known)
+        side = np.maximum(np.rint(0.8 * box.extent / scale), 3).astype(int)
+        mean = cv2.boxFilter(least, cv2.CV_32F, (int(side[0]), int(side[1])))
+        ratio = (mean + _FLOOR) / (float(np.median(mean)) + _FLOOR)
+        ratio[cv2.erode(seen, np.ones((int(side[1]), int(side[0])), np.uint8)) < 255] = 0.0
+        return Residual(ratio, scale, scale * (low + 0.5) - 0.5, self._moves)
+
+    def confirm(self, residual: Residual, place: Floats) -> None:
+        """Learn whether the target, which is surely at ``place`` (2,), moves."""
+        moving, standing = residual.densities(place)
+        if moving != standing:
+            found = self._moves * moving / (self._moves * moving + (1.0 - self._moves) * standing)
+            self._moves = float(np.clip(self._moves + _LEARNING * (found - self._moves), *_BOUNDS))
