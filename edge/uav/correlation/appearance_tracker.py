@@ -239,9 +239,10 @@ class AppearanceTracker:
         box, answer, score, ratio = self._measured(image, self.box, residual)
         if residual.log_ratio(box.centre) < _STANDS:
             # It moved, and what is here stands: what moves beside it may be the target.
-            for place in residual.peaks(box.extent, 1):
+            for place in residual.peaks(box.extent, 2):
                 other = self._measured(image, box.at(place), residual)
-                if other[3] > ratio + _SUPPORT:
+                far = float(np.hypot(*(other[0].centre - self.box.centre))) / self.length
+                if other[3] - 2.0 * np.log1p(2.0 * far**2) > ratio + _SUPPORT:
                     box, answer, score, ratio = other
         self._ratio, peak = ratio, answer.peak
         if self.certain:
@@ -265,7 +266,7 @@ class AppearanceTracker:
     def _measured(
         self, image: Image, box: OrientedBox, residual: Residual
     ) -> tuple[OrientedBox, Response, float, float]:
-        """The target about a box: where, the filter's answer, its similarity, and the log likelihood ratio of it all."""
+        """The target about a box: where, the filter's answer, its similarity, and the log likelihood ratio of all."""
         box, answer = self._respond(image, box)
         score = self._memory.score(image, box)
         ratio = self._memory.tracking_ratio(score) + answer.log_ratio + residual.log_ratio(box.centre)

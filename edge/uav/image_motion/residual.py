@@ -1,4 +1,4 @@
-"""What moves over the static scene: the residual of the stabilised image, for a target too small to be told by its look.
+"""What moves over the static scene: the residual of the stabilised image, for small targets.
 
 Differences to two earlier images, stabilised on the scene; the smaller one counts, so that nothing is left where a
 moving thing was before. A pixel may be any value that its neighbours in the earlier image span: errors of a pixel in
@@ -24,10 +24,10 @@ _SIDE_PX = 14.0  # geometric mean of the target's sides in the reduced image, at
 _MAX_PX = 140  # side of the region that is searched [px, reduced]
 # Of the log ratio in rendered flights: what moves by 2 px or more (mean, std of what is below), what stands; share of
 # the places beside a target where something else moves.
-_MOVING, _STANDING_STD, _OTHERS = (2.0, 0.7), 0.25, 0.08
+_MOVING, _STANDING_STD, _OTHERS = (2.0, 0.7), 0.25, 0.15
 _SURELY = 3.0  # ratio of what moves
 _BOUNDS = (0.1, 0.9)  # of the probability that the target moves
-_LEARNING = 0.1  # share of a new observation of whether the target moves
+_LEARNING, _FIRST_LEARNING = 0.1, 0.4  # share of a new observation of whether the target moves
 _FLOOR = 1.5  # grey levels of difference that noise and compression leave
 
 
@@ -81,10 +81,13 @@ class MovingParts:
 
     def __init__(self) -> None:
         self._moves = 0.5
+        self._first: tuple[float, Floats] | None = None
         self._reduction = 1
         self._past: list[tuple[float, Image, Floats]] = []
 
-    def update(self, image: Image, time: float, box: OrientedBox, motion: Motion, place: Floats, origin: Floats) -> None:
+    def update(
+        self, image: Image, time: float, box: OrientedBox, motion: Motion, place: Floats, origin: Floats
+    ) -> None:
         """Add an image. box: of the target; the scene at ``place`` (2,) is now at ``origin`` (2,)."""
         reduction = max(int(np.sqrt(box.width * box.height) / _SIDE_PX), 1)
         if not motion.trusted or not 0.5 < reduction / self._reduction < 2.0:
@@ -92,6 +95,10 @@ class MovingParts:
         step = np.eye(3)
         step[:2] = motion.matrix
         step[:2, 2] += origin - (motion.matrix[:, :2] @ place + motion.matrix[:, 2])
+        if self._first is None:
+            self._first = time, box.centre
+        elif motion.trusted:
+            self._first = self._first[0], step[:2, :2] @ self._first[1] + step[:2, 2]
         self._past = [(t, old, step @ since) for t, old, since in self._past if time - t < 2.0 * _APART_S + _KEEP_S]
         if not self._past or time - self._past[-1][0] > _KEEP_S:
             size = (image.shape[1] // self._reduction, image.shape[0] // self._reduction)
@@ -100,7 +107,8 @@ class MovingParts:
 
     def residual(self, image: Image, time: float, box: OrientedBox, reach: float) -> Residual:
         """About a box, for centres within ``reach`` [px]; unknown before there are images to compare with."""
-        if not self._past or time - self._past[0][0] < 1.5 * _APART_S:
+        known_s = time - self._past[0][0] if self._past else 0.0
+        if known_s < 0.8 * _APART_S:
             return UNKNOWN
         scale = float(self._reduction)
         rows, columns = self._past[0][1].shape[:2]
@@ -112,12 +120,13 @@ class MovingParts:
         if min(window) < 8:
             return UNKNOWN
         x0, y0 = int(low[0]), int(low[1])
-        region = image[y0 * self._reduction : high[1] * self._reduction, x0 * self._reduction : high[0] * self._reduction]
+        r = self._reduction
+        region = image[y0 * r : high[1] * r, x0 * r : high[0] * r]
         new = region if scale == 1.0 else cv2.resize(region, window, interpolation=cv2.INTER_AREA)
         full = np.array([[scale, 0.0, 0.5 * (scale - 1.0)], [0.0, scale, 0.5 * (scale - 1.0)], [0.0, 0.0, 1.0]])
         shift = np.array([[1.0, 0.0, x0], [0.0, 1.0, y0], [0.0, 0.0, 1.0]])
         least, seen = np.full(window[::-1], 255, np.uint8), np.full(window[::-1], 255, np.uint8)
-        for age in (_APART_S, 2.0 * _APART_S):
+        for age in (_APART_S, 2.0 * _APART_S) if known_s > 1.5 * _APART_S else (known_s,):
             _, old, since = min(self._past, key=lambda kept: abs(time - kept[0] - age))
             inverse = (np.linalg.inv(full) @ np.linalg.inv(since) @ full @ shift)[:2]
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -132,11 +141,17 @@ class MovingParts:
         mean = cv2.boxFilter(least, cv2.CV_32F, (int(side[0]), int(side[1])))
         ratio = (mean + _FLOOR) / (float(np.median(mean)) + _FLOOR)
         ratio[cv2.erode(seen, np.ones((int(side[1]), int(side[0])), np.uint8)) < 255] = 0.0
-        return Residual(ratio, scale, scale * (low + 0.5) - 0.5, self._moves)
+        found = Residual(ratio, scale, scale * (low + 0.5) - 0.5, self._moves)
+        if known_s > 1.5 * _APART_S:
+            return found
+        # Where it was at first, which is sure, something else is seen now: it moves, wherever the tracker has it.
+        if self._first is not None and time - self._first[0] < 1.5 * _APART_S:
+            self.confirm(found, self._first[1], _FIRST_LEARNING)
+        return UNKNOWN
 
-    def confirm(self, residual: Residual, place: Floats) -> None:
+    def confirm(self, residual: Residual, place: Floats, share: float = _LEARNING) -> None:
         """Learn whether the target, which is surely at ``place`` (2,), moves."""
         moving, standing = residual.densities(place)
         if moving != standing:
             found = self._moves * moving / (self._moves * moving + (1.0 - self._moves) * standing)
-            self._moves = float(np.clip(self._moves + _LEARNING * (found - self._moves), *_BOUNDS))
+            self._moves = float(np.clip(self._moves + share * (found - self._moves), *_BOUNDS))
