@@ -237,15 +237,17 @@ class AppearanceTracker:
             return
         residual = self._parts.residual(image, self._time, self.box, _MOVED * self.length)
         box, answer, score, ratio = self._measured(image, self.box, residual)
+        moving = residual.peaks(box.extent, 2)
         if residual.log_ratio(box.centre) < _STANDS:
             # It moved, and what is here stands: what moves beside it may be the target.
-            for place in residual.peaks(box.extent, 2):
+            for place in moving:
                 other = self._measured(image, box.at(place), residual)
                 far = float(np.hypot(*(other[0].centre - self.box.centre))) / self.length
                 if other[3] - 2.0 * np.log1p(2.0 * far**2) > ratio + _SUPPORT:
                     box, answer, score, ratio = other
         self._ratio, peak = ratio, answer.peak
-        if self.certain:
+        if self.certain and (not moving or residual.log_ratio(box.centre) > 0.0):
+            # What stands beside something that moves may have slipped off it: nothing is learnt.
             self._parts.confirm(residual, box.centre)
         if self._support is not None and np.hypot(*(box.centre - self._support)) < _SUPPORT_WITHIN * self.length:
             ratio += _SUPPORT

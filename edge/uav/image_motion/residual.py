@@ -22,10 +22,10 @@ _APART_S = 0.35  # between the images that are compared
 _KEEP_S = 0.08  # between two that are kept
 _SIDE_PX = 14.0  # geometric mean of the target's sides in the reduced image, at least
 _MAX_PX = 140  # side of the region that is searched [px, reduced]
-# Of the log ratio in rendered flights: what moves by 2 px or more (mean, std of what is below), what stands; share of
-# the places beside a target where something else moves.
-_MOVING, _STANDING_STD, _OTHERS = (2.0, 0.7), 0.25, 0.15
-_SURELY = 3.0  # ratio of what moves
+# Of the log ratio in rendered flights: what moves by 2 px or more (mean, std of what is below), what stands; bounds
+# of the share of the places beside a target where something else moves, which is counted.
+_MOVING, _STANDING_STD, _OTHERS = (2.0, 0.7), 0.25, (0.03, 0.3)
+_SURELY = 2.2  # ratio of what moves
 _BOUNDS = (0.1, 0.9)  # of the probability that the target moves
 _LEARNING, _FIRST_LEARNING = 0.1, 0.4  # share of a new observation of whether the target moves
 _FLOOR = 1.5  # grey levels of difference that noise and compression leave
@@ -35,13 +35,15 @@ _FLOOR = 1.5  # grey levels of difference that noise and compression leave
 class Residual:
     """ratio: (h, w) of the mean difference in boxes about each pixel to the median one; 0 where it is not known.
 
-    scale, low: of its pixels. moves: probability that the target moves over the scene.
+    scale, low: of its pixels. moves: probability that the target moves over the scene; others:
+    share of the places where something moves.
     """
 
     ratio: npt.NDArray[np.float32]
     scale: float
     low: Floats
     moves: float
+    others: float = 0.0
 
     def densities(self, place: Floats) -> tuple[float, float]:
         """Densities of the log ratio at a place (2,), for what moves and for what stands; equal where not known."""
@@ -53,7 +55,7 @@ class Residual:
         value = max(float(np.log(ratio)), 0.0)
         moving = np.exp(-0.5 * (min(value - _MOVING[0], 0.0) / _MOVING[1]) ** 2) / (2.5 * _MOVING[1])
         standing = 2.0 * np.exp(-0.5 * (value / _STANDING_STD) ** 2) / (2.5 * _STANDING_STD)
-        return float(moving), float((1.0 - _OTHERS) * standing + _OTHERS * moving + 1e-3)
+        return float(moving), float((1.0 - self.others) * standing + self.others * moving + 1e-3)
 
     def log_ratio(self, place: Floats) -> float:
         """log p(residual | target) - log p(residual | anything else) at a place (2,) [px], natural."""
@@ -141,7 +143,8 @@ class MovingParts:
         mean = cv2.boxFilter(least, cv2.CV_32F, (int(side[0]), int(side[1])))
         ratio = (mean + _FLOOR) / (float(np.median(mean)) + _FLOOR)
         ratio[cv2.erode(seen, np.ones((int(side[1]), int(side[0])), np.uint8)) < 255] = 0.0
-        found = Residual(ratio, scale, scale * (low + 0.5) - 0.5, self._moves)
+        others = float(np.clip((ratio > _SURELY).mean(), *_OTHERS))
+        found = Residual(ratio, scale, scale * (low + 0.5) - 0.5, self._moves, others)
         if known_s > 1.5 * _APART_S:
             return found
         # Where it was at first, which is sure, something else is seen now: it moves, wherever the tracker has it.
