@@ -315,8 +315,9 @@ class AppearanceTracker:
         return moved, answer
 
     def _learn(self, image: Image, box: OrientedBox, score: float, peak: float) -> None:
-        self._filter.learn(image, box, self._memory.agrees(float(self._memory.first_scores(image, [box])[0])))
-        if self._frame % 2 == 0:
+        if self._frame % 2:
+            self._filter.learn(image, box, self._memory.agrees(float(self._memory.first_scores(image, [box])[0])))
+        else:
             self._scale.learn(image, box)
         self._memory.confirm(score)
         self._peak += max(0.1, 1.0 / (self._frame + 1.0)) * (peak - self._peak)

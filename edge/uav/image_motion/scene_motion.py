@@ -69,11 +69,17 @@ class Motion:
             normal = model.T @ (weight[:, None] * model) + np.diag(_PARALLAX_PRIOR)
             correction = np.linalg.solve(normal, model.T @ (weight[:, None] * self.residuals))
             misfit = np.square(self.residuals - model @ correction).sum(axis=1)
-            weight = kept / (1.0 + misfit / (4.0 * max(float(np.median(misfit)), 0.04)))
+            weight = kept / (1.0 + misfit / (4.0 * max(middle(misfit), 0.04)))
         return np.asarray(moved + correction[0])
 
 
 STILL = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), False, 0.0)
+
+
+def middle(values: Floats) -> float:
+    """The upper median: numpy's own takes ten times as long for a hundred values."""
+    half = len(values) // 2
+    return float(np.partition(values, half)[half])
 
 
 class SceneMotion:
