@@ -99,8 +99,7 @@ class AppearanceTracker:
         self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
         self._belief = Belief()
         self._searching = False
-        self._parts = MovingParts()
-        self._parts.update(image, self._time, self.box, STILL, self.box.centre, self.box.centre)
+        self._parts = MovingParts(image, self._time, self.box)
         return self._estimate(time)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
@@ -235,7 +234,7 @@ class AppearanceTracker:
             self._searching = True  # it leaves the image
             self._miss(dt)
             return
-        residual = self._parts.residual(image, self._time, self.box, _MOVED * self.length)
+        residual = self._parts.residual(self._time, self.box, _MOVED * self.length)
         box, answer, score, ratio = self._measured(image, self.box, residual)
         moving = residual.peaks(box.extent, 2)
         if residual.log_ratio(box.centre) < _STANDS:
@@ -375,7 +374,7 @@ class AppearanceTracker:
         self._missed += 1
         self._unseen_s += dt
         expected = self._prediction()
-        residual = self._parts.residual(image, self._time, self.box, 2.0 * expected.wide + self.length)
+        residual = self._parts.residual(self._time, self.box, 2.0 * expected.wide + self.length)
         found = self._redetection.look(image, expected, dt, residual)
         self.debug = self._redetection.debug
         if found is not None:

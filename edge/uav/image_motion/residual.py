@@ -79,77 +79,76 @@ UNKNOWN = Residual(np.zeros((1, 1), np.float32), 1.0, np.zeros(2), 0.0)
 
 
 class MovingParts:
-    """Images of the last second, with the scene's motion since; about the place for which that was measured."""
+    """Reduced images of the last second, each with the map of the scene from it to the newest one.
 
-    def __init__(self) -> None:
+    box: of the target in the first ``image``, at ``time`` [s].
+    """
+
+    def __init__(self, image: Image, time: float, box: OrientedBox) -> None:
         self._moves = 0.5
-        self._first: tuple[float, Floats] | None = None
-        self._reduction = 1
+        self._begun: float = time
+        self._first: Floats | None = box.centre  # where the scene is now at which the target was at first
+        self._reduction = _reduction(box)
         self._past: list[tuple[float, Image, Floats]] = []
+        self._keep(image, time)
+
+    def _keep(self, image: Image, time: float) -> None:
+        size = (image.shape[1] // self._reduction, image.shape[0] // self._reduction)
+        small = image if self._reduction == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        self._now = np.asarray(small, np.uint8)
+        if not self._past or time - self._past[-1][0] > _KEEP_S:
+            self._past.append((time, self._now, np.eye(3)))
 
     def update(
         self, image: Image, time: float, box: OrientedBox, motion: Motion, place: Floats, origin: Floats
     ) -> None:
         """Add an image. box: of the target; the scene at ``place`` (2,) is now at ``origin`` (2,)."""
-        reduction = max(int(np.sqrt(box.width * box.height) / _SIDE_PX), 1)
-        if not motion.trusted or not 0.5 < reduction / self._reduction < 2.0:
-            self._past, self._reduction = [], reduction
+        linear = motion.matrix[:, :2]
+        if self._first is not None:
+            self._first = origin + linear @ (self._first - place)
+        if not motion.trusted or not 0.5 < _reduction(box) / self._reduction < 2.0:
+            self._past, self._first, self._reduction = [], None, _reduction(box)
         step = np.eye(3)
-        step[:2] = motion.matrix
-        step[:2, 2] += origin - (motion.matrix[:, :2] @ place + motion.matrix[:, 2])
-        if self._first is None:
-            self._first = time, box.centre
-        elif motion.trusted:
-            self._first = self._first[0], step[:2, :2] @ self._first[1] + step[:2, 2]
+        step[:2, :2], step[:2, 2] = linear, self._reduced(origin) - linear @ self._reduced(place)
         self._past = [(t, old, step @ since) for t, old, since in self._past if time - t < 2.0 * _APART_S + _KEEP_S]
-        if not self._past or time - self._past[-1][0] > _KEEP_S:
-            size = (image.shape[1] // self._reduction, image.shape[0] // self._reduction)
-            small = image if self._reduction == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-            self._past.append((time, np.asarray(small, np.uint8), np.eye(3)))
+        self._keep(image, time)
 
-    def residual(self, image: Image, time: float, box: OrientedBox, reach: float) -> Residual:
+    def _reduced(self, place: Floats) -> Floats:
+        """A place (2,) in the reduced images."""
+        return (place + 0.5) / self._reduction - 0.5
+
+    def residual(self, time: float, box: OrientedBox, reach: float) -> Residual:
         """About a box, for centres within ``reach`` [px]; unknown before there are images to compare with."""
         known_s = time - self._past[0][0] if self._past else 0.0
-        if known_s < 0.8 * _APART_S:
+        half = np.minimum((reach + 0.5 * box.extent) / self._reduction, 0.5 * _MAX_PX)
+        size, centre = np.array(self._now.shape[1::-1]), self._reduced(box.centre)
+        low = np.clip(np.floor(centre - half), 0, size - 1).astype(int)
+        high = np.clip(np.ceil(centre + half) + 1, 0, size).astype(int)
+        if known_s < 0.8 * _APART_S or (high - low).min() < 8:
             return UNKNOWN
-        scale = float(self._reduction)
-        rows, columns = self._past[0][1].shape[:2]
-        half = np.minimum((reach + 0.5 * box.extent) / scale, 0.5 * _MAX_PX)
-        centre = (box.centre + 0.5) / scale - 0.5
-        low = np.clip(np.floor(centre - half), 0, [columns - 1, rows - 1]).astype(int)
-        high = np.clip(np.ceil(centre + half) + 1, 0, [columns, rows]).astype(int)
-        window = (int(high[0] - low[0]), int(high[1] - low[1]))
-        if min(window) < 8:
-            return UNKNOWN
-        x0, y0 = int(low[0]), int(low[1])
-        r = self._reduction
-        region = image[y0 * r : high[1] * r, x0 * r : high[0] * r]
-        new = region if scale == 1.0 else cv2.resize(region, window, interpolation=cv2.INTER_AREA)
-        full = np.array([[scale, 0.0, 0.5 * (scale - 1.0)], [0.0, scale, 0.5 * (scale - 1.0)], [0.0, 0.0, 1.0]])
-        shift = np.array([[1.0, 0.0, x0], [0.0, 1.0, y0], [0.0, 0.0, 1.0]])
+        new, window = self._now[low[1] : high[1], low[0] : high[0]], (int(high[0] - low[0]), int(high[1] - low[1]))
         least, seen = np.full(window[::-1], 255, np.uint8), np.full(window[::-1], 255, np.uint8)
         for age in (_APART_S, 2.0 * _APART_S) if known_s > 1.5 * _APART_S else (known_s,):
             _, old, since = min(self._past, key=lambda kept: abs(time - kept[0] - age))
-            inverse = (np.linalg.inv(full) @ np.linalg.inv(since) @ full @ shift)[:2]
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            inverse = np.linalg.inv(since)[:2]
+            inverse[:, 2] += inverse[:, :2] @ low
+            flags, kernel = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, np.ones((3, 3), np.uint8)
             before = cv2.warpAffine(old, inverse, window, flags=flags, borderMode=cv2.BORDER_REPLICATE)
             known = cv2.warpAffine(np.full(old.shape[:2], 255, np.uint8), inverse, window, flags=flags)
-            kernel = np.ones((3, 3), np.uint8)
-            above = cv2.subtract(new, cv2.dilate(before, kernel))
-            below = cv2.subtract(cv2.erode(before, kernel), new)
-            difference = np.maximum(above, below).max(axis=2)
-            least, seen = np.minimum(least, difference), np.minimum(seen, known)
-        side = np.maximum(np.rint(0.8 * box.extent / scale), 3).astype(int)
+            above, below = cv2.subtract(new, cv2.dilate(before, kernel)), cv2.subtract(cv2.erode(before, kernel), new)
+            least, seen = np.minimum(least, np.maximum(above, below).max(axis=2)), np.minimum(seen, known)
+        side = np.maximum(np.rint(0.8 * box.extent / self._reduction), 3).astype(int)
         mean = cv2.boxFilter(least, cv2.CV_32F, (int(side[0]), int(side[1])))
         ratio = (mean + _FLOOR) / (float(np.median(mean)) + _FLOOR)
         ratio[cv2.erode(seen, np.ones((int(side[1]), int(side[0])), np.uint8)) < 255] = 0.0
         others = float(np.clip((ratio > _SURELY).mean(), *_OTHERS))
+        scale = float(self._reduction)
         found = Residual(ratio, scale, scale * (low + 0.5) - 0.5, self._moves, others)
         if known_s > 1.5 * _APART_S:
             return found
         # Where it was at first, which is sure, something else is seen now: it moves, wherever the tracker has it.
-        if self._first is not None and time - self._first[0] < 1.5 * _APART_S:
-            self.confirm(found, self._first[1], _FIRST_LEARNING)
+        if self._first is not None and time - self._begun < 1.5 * _APART_S:
+            self.confirm(found, self._first, _FIRST_LEARNING)
         return UNKNOWN
 
     def confirm(self, residual: Residual, place: Floats, share: float = _LEARNING) -> None:
@@ -158,3 +157,7 @@ class MovingParts:
         if moving != standing:
             found = self._moves * moving / (self._moves * moving + (1.0 - self._moves) * standing)
             self._moves = float(np.clip(self._moves + share * (found - self._moves), *_BOUNDS))
+
+
+def _reduction(box: OrientedBox) -> int:
+    return max(int(np.sqrt(box.width * box.height) / _SIDE_PX), 1)
