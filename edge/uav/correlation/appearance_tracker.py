@@ -23,7 +23,7 @@ from edge.uav.correlation.scale import BoxFlow, ScaleFilter
 from edge.uav.correlation.search import search, tile
 from edge.uav.correlation.shape import Outline
 from edge.uav.correlation.velocity import VelocityFilter
-from edge.uav.image_motion.residual import MovingParts, Residual
+from edge.uav.image_motion.residual import MovingParts
 from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
 from edge.uav.target.box import check_target_box
 from protocols.geometry.types import Floats
@@ -235,19 +235,21 @@ class AppearanceTracker:
             self._miss(dt)
             return
         residual = self._parts.residual(self._time, self.box, _MOVED * self.length)
-        box, answer, score, ratio = self._measured(image, self.box, residual)
-        moving = residual.peaks(box.extent, 2)
-        if residual.log_ratio(box.centre) < _STANDS:
+        box, answer, score, ratio = self._measured(image, self.box)
+        moving, moved = residual.peaks(box.extent, 2), residual.log_ratio(box.centre)
+        if moved < _STANDS:
             # It moved, and what is here stands: what moves beside it may be the target.
             for place in moving:
-                other = self._measured(image, box.at(place), residual)
+                other = self._measured(image, box.at(place))
+                evidence = other[3] + residual.log_ratio(other[0].centre)
                 far = float(np.hypot(*(other[0].centre - self.box.centre))) / self.length
-                if other[3] - 2.0 * np.log1p(2.0 * far**2) > ratio + _SUPPORT:
-                    box, answer, score, ratio = other
-        self._ratio, peak = ratio, answer.peak
-        if self.certain and (not moving or residual.log_ratio(box.centre) > 0.0):
+                if evidence - 2.0 * np.log1p(2.0 * far**2) > ratio + moved + _SUPPORT:
+                    (box, answer, score, ratio), moved = other, evidence - other[3]
+        self._ratio, peak = ratio, answer.peak  # what it looks like: that something moves is no reason to learn it
+        if self.certain and (not moving or moved > 0.0):
             # What stands beside something that moves may have slipped off it: nothing is learnt.
             self._parts.confirm(residual, box.centre)
+        ratio += moved
         if self._support is not None and np.hypot(*(box.centre - self._support)) < _SUPPORT_WITHIN * self.length:
             ratio += _SUPPORT
         # It can only be there if it is in the filter's window at all.
@@ -264,14 +266,11 @@ class AppearanceTracker:
         elif not self.certain and self._frame % _OBSERVE_DOUBTFUL_EVERY == 0:
             self._observe_rivals(image, box)
 
-    def _measured(
-        self, image: Image, box: OrientedBox, residual: Residual
-    ) -> tuple[OrientedBox, Response, float, float]:
-        """The target about a box: where, the filter's answer, its similarity, and the log likelihood ratio of all."""
+    def _measured(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, Response, float, float]:
+        """The target about a box: where, the filter's answer, its similarity, and the log likelihood ratio of both."""
         box, answer = self._respond(image, box)
         score = self._memory.score(image, box)
-        ratio = self._memory.tracking_ratio(score) + answer.log_ratio + residual.log_ratio(box.centre)
-        return box, answer, score, ratio
+        return box, answer, score, self._memory.tracking_ratio(score) + answer.log_ratio
 
     def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
