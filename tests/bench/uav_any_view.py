@@ -127,11 +127,12 @@ def flight(
     return Sequence(f"{target} {path} {seed}", kind, images, box[first:], rate, visible[first:])
 
 
-def rendered(seeds: range, ranges: list[float]) -> Iterator[Sequence]:
+def rendered(seeds: range, ranges: list[float], kinds: list[str]) -> Iterator[Sequence]:
     """Rendered flights: every target, every flight, at 10 to 30 frames a second, the factors of the range in turn."""
+    paths = [path for path in FLIGHTS if not kinds or ("rendered away" if path == "away" else "rendered") in kinds]
     for seed in seeds:
         for k, target in enumerate(TARGETS):
-            for path in FLIGHTS:
+            for path in paths:
                 rate, away_s, factor = (of[(seed + k) % len(of)] for of in (_RATES, AWAY_S, ranges))
                 yield flight(target, path, 10 * seed + k, rate, away_s, range_factor=factor)
 
@@ -227,7 +228,7 @@ def main() -> None:
     sources: list[Iterator[Sequence]] = []
     if not kinds or any(kind.startswith("rendered") for kind in kinds):
         seeds = range(options.first_seed, options.first_seed + options.seeds)
-        sources.append(rendered(seeds, [float(factor) for factor in options.ranges.split(",")]))
+        sources.append(rendered(seeds, [float(factor) for factor in options.ranges.split(",")], kinds))
     if not kinds or any(not kind.startswith("rendered") for kind in kinds):
         sources.append(real(options.data, not kinds or any("away" in kind for kind in kinds)))
     scores = [
