@@ -60,6 +60,7 @@ class TemplateMemory:
         self._target = _Normal(0.8, 0.15, 4.0, 60.0)
         self._background = _Normal(0.2, 0.2, 2.0, 200.0)
         self._rival = _Normal(0.4, 0.1, 1.0, 6.0)
+        self._spectra: dict[tuple[int, int, int], npt.NDArray[np.complex64]] = {}
         self._tail = np.zeros(_TAIL_BINS)
         self._places = _PLACES
 
@@ -72,6 +73,7 @@ class TemplateMemory:
                 return
         self._templates.append(new)
         self._used.append(self._count)
+        self._spectra.clear()
         if len(self._templates) > _MAX_TEMPLATES:
             oldest = 1 + int(np.argmin(self._used[1:]))
             del self._templates[oldest], self._used[oldest]
@@ -110,12 +112,20 @@ class TemplateMemory:
         spectrum = scipy.fft.rfft2(planes, s=shape)
         best = np.full(norm.shape, -1.0)
         for template in self._scanned():
-            cells = template.reshape(len(features), CELLS, CELLS)
-            product = (spectrum * np.conj(scipy.fft.rfft2(cells, s=shape))).sum(axis=0)
+            product = (spectrum * self._spectrum(template, shape)).sum(axis=0)
             raw = scipy.fft.irfft2(product, s=shape)[valid]
-            raw = raw - _CENTRED * np.tensordot(cells.sum(axis=(1, 2)), mean, 1)
+            sums = template.reshape(len(features), -1).sum(axis=1)
+            raw = raw - _CENTRED * np.tensordot(sums, mean, 1)
             np.maximum(best, raw / norm, out=best)
         return best
+
+    def _spectrum(self, template: Features, shape: tuple[int, int]) -> npt.NDArray[np.complex64]:
+        """Conjugate spectrum of a template's planes, padded to ``shape``; kept, for regions of few shapes recur."""
+        key = (id(template), *shape)
+        if key not in self._spectra:
+            cells = template.reshape(-1, CELLS, CELLS)
+            self._spectra[key] = np.asarray(np.conj(scipy.fft.rfft2(cells, s=shape)), np.complex64)
+        return self._spectra[key]
 
     def _scanned(self) -> list[Features]:
         """The first template and those that matched last."""
