@@ -87,8 +87,11 @@ class Redetection:
         self._tested = [c for c in self._tested if self._test(image, c, expected, dt)]
         if not self._tested or self._tested[0].log_odds < _PROMISING or expected.frames % 2 == 0:
             self._search(image, expected, dt)
-        self._tested.sort(key=lambda c: -c.log_odds)
-        del self._tested[_MOST_TESTED:]
+        kept: list[Candidate] = []
+        for candidate in sorted(self._tested, key=lambda c: -c.log_odds):
+            if not any(c.covers(candidate.box) for c in kept):  # two that came to one place are no rivals
+                kept.append(candidate)
+        self._tested = kept[:_MOST_TESTED]
         if not self._tested:
             return None
         best = self._tested[0]

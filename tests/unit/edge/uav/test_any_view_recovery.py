@@ -215,3 +215,15 @@ def test_while_the_target_is_beyond_the_border_a_place_needs_higher_odds() -> No
         found.append(search.look(image, expected, 1.0 / FPS))
     assert found[0] is not None
     assert found[1] is None
+
+
+def test_two_places_under_test_that_come_to_one_are_no_rivals() -> None:
+    """Both had settled on the target: neither had a margin over the other for a second and a half."""
+    search, expected = redetection(), prediction(160.0)
+    search._tested = [
+        Candidate(OrientedBox(x, 120.0, 30.0, 20.0), prior, expected.motion, 5, 6.0, 6.0)
+        for x, prior in ((160.0, -0.2), (161.0, -0.5))
+    ]
+    search._test = lambda *of: True  # type: ignore[method-assign]
+    search._search = lambda *of: None  # type: ignore[method-assign]
+    assert search.look(np.zeros((SIZE[1], SIZE[0], 3), np.uint8), expected, 1.0 / FPS) is not None
