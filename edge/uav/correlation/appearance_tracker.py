@@ -84,8 +84,6 @@ class AppearanceTracker:
         self._memory.add(image, self.box)
         self._observe_background(image, self.box)
         self._shape = Outline(image, self.box)
-        # On the image that it has learnt a filter answers higher than it will on any other.
-        self._peak = 0.6 * max(self._filter.respond(image, self.box).peak, 0.05)
         self._missed = 0
         self._unseen_s = 0.0
         self._scene.keep()
@@ -245,7 +243,7 @@ class AppearanceTracker:
                 far = float(np.hypot(*(other[0].centre - self.box.centre))) / self.length
                 if evidence - 2.0 * np.log1p(2.0 * far**2) > ratio + moved + _SUPPORT:
                     (box, answer, score, ratio), moved = other, evidence - other[3]
-        self._ratio, peak = ratio, answer.peak  # what it looks like: that something moves is no reason to learn it
+        self._ratio = ratio  # what it looks like: that something moves is no reason to learn it
         if self.certain and (not moving or moved > 0.0):
             # What stands beside something that moves may have slipped off it: nothing is learnt.
             self._parts.confirm(residual, box.centre)
@@ -255,9 +253,15 @@ class AppearanceTracker:
         # It can only be there if it is in the filter's window at all.
         self._belief.doubt(math.erf(_WINDOW * self.length / self._motion_filter.std / math.sqrt(2.0)) ** 2)
         self._belief.add(ratio, dt)
-        self.debug = {"peak": peak, "ratio": answer.ratio, "score": score, "llr": ratio, "b": self._belief.log_odds}
+        self.debug = {
+            "peak": answer.peak,
+            "ratio": answer.ratio,
+            "score": score,
+            "llr": ratio,
+            "b": self._belief.log_odds,
+        }
         if self._belief.visible:
-            self._accept(image, box, score, peak, dt)
+            self._accept(image, box, score, dt)
         else:
             self._searching = self._belief.gone or self._motion_filter.std > self.length
             self._miss(dt)
@@ -272,7 +276,7 @@ class AppearanceTracker:
         score = self._memory.score(image, box)
         return box, answer, score, self._memory.tracking_ratio(score) + answer.log_ratio
 
-    def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, dt: float) -> None:
+    def _accept(self, image: Image, box: OrientedBox, score: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
         self._broken = False
         inside = box.share_inside(self._size)
@@ -292,7 +296,7 @@ class AppearanceTracker:
             sides = np.clip(box.sides * factor, self._first / _MAX_GROWTH, self._first * _MAX_GROWTH)
             box = box.sized(np.clip(sides, 4.0, 0.9 * np.array(self._size)))
             if self._ratio > _LEARN_ABOVE and self._belief.log_odds > _CERTAIN:
-                self._learn(image, box, score, peak)
+                self._learn(image, box, score)
             if self._frame % _KEEP_EVERY == 0:
                 self._scene.keep()
                 self._since_keyframe = np.eye(3)
@@ -312,13 +316,12 @@ class AppearanceTracker:
                 return moved.at(moved.centre + [again.x, again.y]), again
         return moved, answer
 
-    def _learn(self, image: Image, box: OrientedBox, score: float, peak: float) -> None:
+    def _learn(self, image: Image, box: OrientedBox, score: float) -> None:
         if self._frame % 2:
             self._filter.learn(image, box, self._memory.agrees(float(self._memory.first_scores(image, [box])[0])))
         else:
             self._scale.learn(image, box)
         self._memory.confirm(score)
-        self._peak += max(0.1, 1.0 / (self._frame + 1.0)) * (peak - self._peak)
         if self._frame % _OBSERVE_EVERY == 0:
             self._memory.add(image, box)
 
