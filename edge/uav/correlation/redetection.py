@@ -24,6 +24,7 @@ _PROPOSED = 1.0  # log prior of a place that another tracker has found
 _PROMISING = 0.0  # log odds of a place under test above which others are searched about the prediction only
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
 _MOST_TESTED, _RIVAL_MARGIN = 2, 2.0  # places that are tested at once; log odds within which one is a rival
+_OUTSIDE = 2.0  # log odds that a place must exceed, with the margin, while the target is surely beyond the border
 _MOST_MOVING = 2  # places at which something moves that are looked at, a search
 _DETECTION = 0.25  # probability that one search finds a target in view
 _HIDDEN = 0.1  # probability that it is in view, but behind something, for as long as it is away
@@ -96,7 +97,9 @@ class Redetection:
         best = self._tested[0]
         others = [c.log_odds for c in self._tested[1:]]
         self.debug |= {"sum": best.log_odds, "next": max(others, default=-99.0), "near": self._near}
-        return best if best.accepted and best.log_odds > max(others, default=0.0) + _MARGIN else None
+        # While it is beyond the border, each search is another chance for what only looks like it.
+        least = max(0.0, _OUTSIDE * (1.0 - expected.box.probability_inside(expected.std, self._size)), *others)
+        return best if best.accepted and best.log_odds > least + _MARGIN else None
 
     def _search(self, image: Image, expected: Prediction, dt: float) -> None:
         """Take up the likeliest new place: in turn about the prediction, and in one tile after the other."""
