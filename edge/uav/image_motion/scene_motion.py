@@ -96,9 +96,8 @@ class SceneMotion:
 
     def update(self, image: Image, excluded: Floats | None) -> Motion:
         """The motion since the last image. excluded: x0, y0, x1, y1 of the moving target in the last image [px]."""
-        # Averages over whole and broken pixels take ten times as long; up to a factor of two nothing aliases.
-        how = cv2.INTER_LINEAR if self._scale <= 2.0 else cv2.INTER_AREA
-        gray = np.asarray(cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), self._size, interpolation=how), np.uint8)
+        small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), self._size, interpolation=cv2.INTER_AREA)
+        gray = np.asarray(small, np.uint8)
         previous, self._gray = self._gray, gray
         if previous is None:
             return STILL
@@ -113,15 +112,12 @@ class SceneMotion:
         return motion
 
     def _corners(self, gray: Gray, excluded: Floats | None) -> npt.NDArray[np.float32]:
-        half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # the flow needs no exact corners
-        mask = np.full(half.shape, 255, np.uint8)
+        mask = np.full(gray.shape, 255, np.uint8)
         if excluded is not None and np.isfinite(excluded).all():
-            x0, y0, x1, y1 = (int(v) for v in np.clip(0.5 * excluded / self._scale, -10, 1e4))
+            x0, y0, x1, y1 = (int(v) for v in np.clip(excluded / self._scale, -10, 1e4))
             mask[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = 0
-        found = cv2.goodFeaturesToTrack(half, _MAX_TRACKS, 0.005, max(half.shape[1] // 36, 3), mask=mask, blockSize=3)
-        return (
-            np.zeros((0, 2), np.float32) if found is None else np.asarray(2.0 * found + 0.5, np.float32).reshape(-1, 2)
-        )
+        found = cv2.goodFeaturesToTrack(gray, _MAX_TRACKS, 0.005, max(gray.shape[1] // 36, 5), mask=mask, blockSize=3)
+        return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
 
     def _flow(self, old: Gray, new: Gray, corners: npt.NDArray[np.float32], start: Floats) -> tuple[Floats, Floats]:
         """Old and new positions (n, 2) of the corners that are tracked forward and back."""
