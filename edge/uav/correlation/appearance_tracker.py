@@ -243,7 +243,7 @@ class AppearanceTracker:
                 far = float(np.hypot(*(other[0].centre - self.box.centre))) / self.length
                 if evidence - 2.0 * np.log1p(2.0 * far**2) > ratio + moved + _SUPPORT:
                     (box, answer, score, ratio), moved = other, evidence - other[3]
-        self._ratio = ratio  # what it looks like: that something moves is no reason to learn it
+        self._ratio = ratio + min(moved, 0.0)  # that something moves is no reason to learn what it looks like
         if self.certain and (not moving or moved > 0.0):
             # What stands beside something that moves may have slipped off it: nothing is learnt.
             self._parts.confirm(residual, box.centre)

@@ -18,10 +18,6 @@ ORIENTATIONS = 9  # as in Felzenszwalb's HOG
 CHANNELS = ORIENTATIONS + 3
 _CLIP = 0.4  # of a normalised histogram entry: one strong edge does not make the cell
 _NOISE_LEVEL = 4.0  # gradient [grey levels a pixel] of sensor noise and compression, which gets no unit contrast
-_LEVELS = 14  # of the angle from one orientation to the next: 1.4 degrees each, and a turn fits a byte
-# Shares (9, 256) of the orientations at each level of the angle: linear between neighbours, alike after half a turn.
-_SHARES = np.arange(256) / _LEVELS - np.arange(ORIENTATIONS)[:, None] + 0.5 * ORIENTATIONS
-_SHARES = np.maximum(1.0 - np.abs(_SHARES % ORIENTATIONS - 0.5 * ORIENTATIONS), 0.0).astype(np.float32)
 _COLOUR_GAIN = 1.0 / 48.0  # a difference of 48 grey levels counts as much as a full histogram entry
 
 
@@ -30,14 +26,19 @@ def cell_features(patch: Image, cell: int = 4) -> Features:
     height, width = patch.shape[:2]
     size = (width // cell, height // cell)
     lab = cv2.cvtColor(patch, cv2.COLOR_BGR2LAB)
-    lightness = cv2.extractChannel(lab, 0)
+    lightness = cv2.extractChannel(lab, 0).astype(np.float32)
     magnitude, angle = cv2.cartToPolar(
         cv2.Sobel(lightness, cv2.CV_32F, 1, 0, ksize=1), cv2.Sobel(lightness, cv2.CV_32F, 0, 1, ksize=1)
     )
-    at = cv2.convertScaleAbs(angle, alpha=_LEVELS * ORIENTATIONS / np.pi)
+    at = angle * np.float32(ORIENTATIONS / np.pi)
+    at[at >= ORIENTATIONS] -= ORIENTATIONS
     out = np.empty((CHANNELS, size[1], size[0]), np.float32)
-    for orientation, shares in enumerate(_SHARES):
-        cv2.resize(cv2.multiply(magnitude, cv2.LUT(at, shares)), size, out[orientation], interpolation=cv2.INTER_AREA)
+    for orientation in range(ORIENTATIONS):
+        away = np.abs(at - np.float32(orientation))
+        if orientation == 0:
+            away = np.minimum(away, ORIENTATIONS - away)
+        share = np.maximum(np.float32(1.0) - away, np.float32(0.0))
+        out[orientation] = cv2.resize(magnitude * share, size, interpolation=cv2.INTER_AREA)
     histogram = out[:ORIENTATIONS]
     energy = cv2.boxFilter(np.square(histogram).sum(axis=0), -1, (3, 3))
     histogram /= np.sqrt(energy + np.float32(_NOISE_LEVEL**2))
