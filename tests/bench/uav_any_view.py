@@ -31,6 +31,7 @@ from tests.bench.uav_sequences import AWAY_S, Sequence, aerial, oblique, pan_awa
 MODELS = ("ground", *uav_rivals.NAMES)
 NEAR_PX, HELD_FRAMES = 20.0, 20
 _RATES = (10.0, 15.0, 30.0)
+_LEAST_PX = 4.0  # side of a target that the trackers take
 
 
 @dataclass(slots=True)
@@ -134,7 +135,9 @@ def rendered(seeds: range, ranges: list[float], kinds: list[str]) -> Iterator[Se
         for k, target in enumerate(TARGETS):
             for path in paths:
                 rate, away_s, factor = (of[(seed + k) % len(of)] for of in (_RATES, AWAY_S, ranges))
-                yield flight(target, path, 10 * seed + k, rate, away_s, range_factor=factor)
+                sequence = flight(target, path, 10 * seed + k, rate, away_s, range_factor=factor)
+                if sequence.box[0, 2:].min() >= _LEAST_PX:
+                    yield sequence
 
 
 def real(data: Path, windows: bool = True) -> Iterator[Sequence]:

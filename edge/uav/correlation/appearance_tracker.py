@@ -63,7 +63,6 @@ class AppearanceTracker:
         self._scene = SceneMotion(size)
         self.follows = True
         """Whether the other tracker's prediction moves with the scene."""
-        self.debug: dict[str, float] = {}
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
@@ -117,7 +116,6 @@ class AppearanceTracker:
         place = self.box.centre
         origin = self._predict(dt)
         self._parts.update(image, self._time, self.box, self.motion, place, origin)
-        self.debug = {}
         if not self._searching:
             self._track(image, dt)
         else:
@@ -233,16 +231,16 @@ class AppearanceTracker:
             self._miss(dt)
             return
         residual = self._parts.residual(self._time, self.box, _MOVED * self.length)
-        box, answer, score, ratio = self._measured(image, self.box)
+        box, score, ratio = self._measured(image, self.box)
         moving, moved = residual.peaks(box.extent, 2), residual.log_ratio(box.centre)
         if moved < _STANDS:
             # It moved, and what is here stands: what moves beside it may be the target.
             for place in moving:
-                other = self._measured(image, box.at(place))
-                evidence = other[3] + residual.log_ratio(other[0].centre)
-                far = float(np.hypot(*(other[0].centre - self.box.centre))) / self.length
-                if evidence - 2.0 * np.log1p(2.0 * far**2) > ratio + moved + _SUPPORT:
-                    (box, answer, score, ratio), moved = other, evidence - other[3]
+                other, *seen = self._measured(image, box.at(place))
+                moves = residual.log_ratio(other.centre)
+                far = float(np.hypot(*(other.centre - self.box.centre))) / self.length
+                if seen[1] + moves - 2.0 * np.log1p(2.0 * far**2) > ratio + moved + _SUPPORT:
+                    box, (score, ratio), moved = other, seen, moves
         self._ratio = ratio + min(moved, 0.0)  # that something moves is no reason to learn what it looks like
         if self.certain and (not moving or moved > 0.0):
             # What stands beside something that moves may have slipped off it: nothing is learnt.
@@ -253,13 +251,6 @@ class AppearanceTracker:
         # It can only be there if it is in the filter's window at all.
         self._belief.doubt(math.erf(_WINDOW * self.length / self._motion_filter.std / math.sqrt(2.0)) ** 2)
         self._belief.add(ratio, dt)
-        self.debug = {
-            "peak": answer.peak,
-            "ratio": answer.ratio,
-            "score": score,
-            "llr": ratio,
-            "b": self._belief.log_odds,
-        }
         if self._belief.visible:
             self._accept(image, box, score, dt)
         else:
@@ -270,11 +261,11 @@ class AppearanceTracker:
         elif not self.certain and self._frame % _OBSERVE_DOUBTFUL_EVERY == 0:
             self._observe_rivals(image, box)
 
-    def _measured(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, Response, float, float]:
-        """The target about a box: where, the filter's answer, its similarity, and the log likelihood ratio of both."""
+    def _measured(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, float, float]:
+        """The target about a box: where, its similarity, and the log likelihood ratio by that and by the filter."""
         box, answer = self._respond(image, box)
         score = self._memory.score(image, box)
-        return box, answer, score, self._memory.tracking_ratio(score) + answer.log_ratio
+        return box, score, self._memory.tracking_ratio(score) + answer.log_ratio
 
     def _accept(self, image: Image, box: OrientedBox, score: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
@@ -378,7 +369,6 @@ class AppearanceTracker:
         expected = self._prediction()
         residual = self._parts.residual(self._time, self.box, 2.0 * expected.wide + self.length)
         found = self._redetection.look(image, expected, dt, residual)
-        self.debug = self._redetection.debug
         if found is not None:
             self._missed, self._unseen_s, self._searching = 0, 0.0, False
             self.box = found.box

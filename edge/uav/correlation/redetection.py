@@ -65,7 +65,6 @@ class Redetection:
         self._inside, self._unnoticed = 0.0, 1.0  # probability that it is in the image, and that it was not seen there
         self._tested: list[Candidate] = []
         self._moving = UNKNOWN
-        self.debug: dict[str, float] = {}
 
     def move(self, motion: Motion, reach: float, dt: float) -> None:
         """Predict the places under test into the next frame."""
@@ -83,7 +82,7 @@ class Redetection:
 
     def look(self, image: Image, expected: Prediction, dt: float, moving: Residual = UNKNOWN) -> Candidate | None:
         """Search one image; the place that is taken for the target, if any: by its odds, and a margin over the next."""
-        self.debug, self._moving = {}, moving
+        self._moving = moving
         self._tested = [c for c in self._tested if self._test(image, c, expected, dt)]
         if not self._tested or self._tested[0].log_odds < _PROMISING or expected.frames % 2 == 0:
             self._search(image, expected, dt)
@@ -96,7 +95,6 @@ class Redetection:
             return None
         best = self._tested[0]
         others = [c.log_odds for c in self._tested[1:]]
-        self.debug |= {"sum": best.log_odds, "next": max(others, default=-99.0), "near": self._near}
         # While it is beyond the border, each search is another chance for what only looks like it.
         least = max(0.0, _OUTSIDE * (1.0 - expected.box.probability_inside(expected.std, self._size)), *others)
         return best if best.accepted and best.log_odds > least + _MARGIN else None
@@ -166,7 +164,6 @@ class Redetection:
         evidence = self._memory.log_ratio(score, _CHANGE, answer.log_ratio)
         evidence += self._moving.log_ratio(box.centre)
         candidate.add(box, evidence, dt)
-        self.debug |= {"score": score, "llr": evidence, "ratio": answer.ratio, "prior": candidate.prior}
         return candidate.promising and box.share_inside(self._size) > _MIN_INSIDE
 
 
