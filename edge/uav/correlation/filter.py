@@ -113,8 +113,8 @@ class CorrelationFilter:
         product = (np.conj(self._past) * spectrum).sum(axis=0)
         past = np.fft.fftshift(scipy.fft.irfft2(product, s=self._cells[::-1]))
         near, other = float(past[away <= 1.5].max()), float(past[away > self._exclude].max())
-        dx = self._dx[0][row, column] + _refined(answer[row], column)
-        dy = self._dx[1][row, column] + _refined(answer[:, column], row)
+        dx = self._dx[0][row, column] + refined(answer[row], column)
+        dy = self._dx[1][row, column] + refined(answer[:, column], row)
         offset = box.axes @ (np.array([dx, dy]) * box.sides * self._window / np.array(self._cells))
         return Response(float(offset[0]), float(offset[1]), peak, max(near, 0.0) / max(other, 1e-3))
 
@@ -154,11 +154,11 @@ def windowed(features: Features, window: npt.NDArray[np.float32]) -> Features:
     return np.asarray((features - mean) * window, np.float32)
 
 
-def _refined(values: npt.NDArray[np.floating], at: int) -> float:
+def refined(values: npt.NDArray[np.floating], at: int) -> float:
     """Offset of the maximum of a parabola through a maximum and its two neighbours (cyclic)."""
     left, mid, right = float(values[at - 1]), float(values[at]), float(values[(at + 1) % len(values)])
     curvature = left - 2.0 * mid + right
-    return float(np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0
+    return float(np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)) if curvature < -1e-6 else 0.0
 
 
-__all__ = ["CorrelationFilter", "Response", "windowed"]
+__all__ = ["CorrelationFilter", "Response", "refined", "windowed"]

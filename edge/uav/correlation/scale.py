@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from edge.uav.base import Image
 from edge.uav.correlation.features import cell_features
+from edge.uav.correlation.filter import refined
 from edge.uav.correlation.oriented_box import OrientedBox, crop
 from edge.uav.image_motion.scene_motion import middle
 from protocols.geometry.types import Floats
@@ -125,11 +126,8 @@ class ScaleFilter:
         product = (np.conj(self._numerator) * spectrum).sum(axis=0) / (self._denominator + regular)
         answer = np.fft.fftshift(np.fft.irfft(product, n=_SCALES))
         k = int(answer.argmax())
-        at = float(self._steps[k])
-        if 0 < k < _SCALES - 1:
-            left, mid, right = answer[k - 1], answer[k], answer[k + 1]
-            at += float(np.clip(0.5 * (left - right) / min(left - 2 * mid + right, -1e-9), -0.5, 0.5))
-        return float(_STEP**at)
+        between = refined(answer, k) if 0 < k < _SCALES - 1 else 0.0
+        return float(_STEP ** (self._steps[k] + between))
 
     def _spectrum(self, image: Image, box: OrientedBox) -> npt.NDArray[np.complex128]:
         stack = np.concatenate([crop(image, box.sized(box.sides * f), (_SIDE, _SIDE)) for f in self._factors], axis=0)
