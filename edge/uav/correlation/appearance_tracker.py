@@ -50,8 +50,6 @@ _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
 _TRIAL_SIZES = (0.9, 1.1)
 _SURE_STD = 0.5  # of where it must be since the evidence was clear, in lengths, to go back to that
 _LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
-_KEEP_EVERY = 5  # frames between two keyframes
-_RELOCATE_EVERY = 4  # frames between two attempts to recognise the scene
 
 
 class AppearanceTracker:
@@ -85,11 +83,8 @@ class AppearanceTracker:
         self._shape = Outline(image, self.box)
         self._missed = 0
         self._unseen_s = 0.0
-        self._scene.keep()
-        self._last_sight, self._since_keyframe = (self.box, np.zeros(2)), np.eye(3)
         self._redetection = Redetection(self._size, self._memory, self._respond)
         self._ratio = 0.0
-        self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
         self._expected: Estimate | None = None
         self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
         self._other_std = np.inf
@@ -158,8 +153,6 @@ class AppearanceTracker:
         origin = box.centre
         if motion.trusted:
             self._trusted_at = self._time
-            if self._missed == 0:
-                self._since_keyframe = _square(motion.matrix) @ self._since_keyframe
             origin, sure = motion.at(box.centre, self._scene.reach), sure.at(motion.at(sure.centre, self._scene.reach))
             for moving in (self._motion_filter, velocity):
                 moving.follow_scene(motion.matrix[:, :2])
@@ -171,17 +164,10 @@ class AppearanceTracker:
             for moving in (self._motion_filter, velocity):
                 moving.lose_scene(_UNKNOWN_STEP * self._size[0])
         if self._missed:
-            self._broken |= not motion.trusted
             angle = self._turn_rate * dt
             self._motion_filter.turn(angle)
             self._turn_rate *= float(np.exp(-dt / 0.7))
             box = box.turned(angle)
-            # A similarity to the whole scene is coarser than the chain with its parallax, as long as that holds.
-            if self._broken and self._searching and self._missed % _RELOCATE_EVERY == 1:
-                relocated = self._relocated()
-                if relocated is not None:
-                    box, origin, self._broken = relocated, relocated.centre, False
-                    self._motion_filter.find_scene()
         self.box = box.at(origin + self._motion_filter.predict(dt, self.length))
         self._sure = sure.at(sure.centre + velocity.predict(dt, self.length)), velocity
         if expected is not None:
@@ -208,21 +194,6 @@ class AppearanceTracker:
                 self.box, self._other_std = box, expected.std
             if not self.motion.trusted:
                 self._sure = self.box, copy(self._motion_filter)
-
-    def _relocated(self) -> OrientedBox | None:
-        """The target's prediction from where it was last seen, in the scene that is now recognised."""
-        matrix = self._scene.relocate()
-        if matrix is None:
-            return None
-        seen, velocity = self._last_sight
-        # From the image of the last sight to the keyframe, and on to this image.
-        matrix = (_square(matrix) @ np.linalg.inv(self._since_keyframe))[:2]
-        linear = matrix[:, :2]
-        self._motion_filter.velocity = linear @ velocity
-        moved = seen.at(linear @ seen.centre + matrix[:, 2] + self._motion_filter.velocity * self._unseen_s)
-        zoom = float(np.sqrt(abs(np.linalg.det(linear))))
-        turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
-        return moved.sized(seen.sides * zoom).turned(turn)
 
     def _track(self, image: Image, dt: float) -> None:
         """Measure the target about its prediction."""
@@ -269,7 +240,6 @@ class AppearanceTracker:
 
     def _accept(self, image: Image, box: OrientedBox, score: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
-        self._broken = False
         inside = box.share_inside(self._size)
         # Where it looks less like the target than what is beside it, it says little about how the target moves.
         unsure = 1.0 - inside if self._ratio > 0.0 else 1.0
@@ -288,10 +258,6 @@ class AppearanceTracker:
             box = box.sized(np.clip(sides, 4.0, 0.9 * np.array(self._size)))
             if self._ratio > _LEARN_ABOVE and self._belief.log_odds > _CERTAIN:
                 self._learn(image, box, score)
-            if self._frame % _KEEP_EVERY == 0:
-                self._scene.keep()
-                self._since_keyframe = np.eye(3)
-            self._last_sight = box, self._motion_filter.velocity
             if self.certain and self._belief.log_odds > _CERTAIN:
                 self._sure = box, copy(self._motion_filter)
         self.box = box
@@ -398,8 +364,3 @@ class AppearanceTracker:
         moves = state is not TrackState.LOST and np.hypot(*velocity) > _MOVES * self.length
         heading = float(np.arctan2(velocity[1], velocity[0])) if moves else np.nan
         return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), heading, self.std)
-
-
-def _square(matrix: Floats) -> Floats:
-    """(3, 3) of a map (2, 3)."""
-    return np.vstack([matrix, [0.0, 0.0, 1.0]])

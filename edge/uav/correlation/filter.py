@@ -159,6 +159,3 @@ def refined(values: npt.NDArray[np.floating], at: int) -> float:
     left, mid, right = float(values[at - 1]), float(values[at]), float(values[(at + 1) % len(values)])
     curvature = left - 2.0 * mid + right
     return float(np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)) if curvature < -1e-6 else 0.0
-
-
-__all__ = ["CorrelationFilter", "Response", "refined", "windowed"]

@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from edge.uav.base import Image
 from edge.uav.correlation.oriented_box import OrientedBox
-from edge.uav.image_motion.keyframe import Keyframe
 from protocols.geometry.types import Bools, Floats
 
 Gray = npt.NDArray[np.uint8]
@@ -90,7 +89,6 @@ class SceneMotion:
         self._size = (round(size[0] / self._scale), round(size[1] / self._scale))
         self._gray: Gray | None = None
         self._last = np.eye(2, 3)
-        self._keyframe: Keyframe | None = None
         self.reach = _REACH * size[0]
         """Distance over which parallax is taken to be alike [px]."""
 
@@ -154,18 +152,6 @@ class SceneMotion:
         full = self._to_full(np.asarray(matrix, np.float64))
         points = self._scale * (old[near] + 0.5) - 0.5
         return Motion(full, points, self._scale * residual[near], trusted, share)
-
-    def keep(self) -> None:
-        """Keep the last image as the keyframe."""
-        if self._gray is not None:
-            self._keyframe = Keyframe(self._gray)
-
-    def relocate(self) -> Floats | None:
-        """Similarity (2, 3) to the last image from the keyframe [px]; None where the scene is not recognised."""
-        if self._keyframe is None or self._gray is None:
-            return None
-        found = self._keyframe.locate(self._gray)
-        return None if found is None else self._to_full(found)
 
     def _to_full(self, matrix: Floats) -> Floats:
         out = matrix.copy()

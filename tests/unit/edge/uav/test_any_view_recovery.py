@@ -115,15 +115,6 @@ def test_what_moves_is_predicted_less_surely_than_what_stands() -> None:
     assert stds[1] > 1.8 * stds[0]
 
 
-def test_a_scene_that_is_recognised_again_ends_the_doubt_about_where_it_is() -> None:
-    kept = VelocityFilter(20.0)
-    before = kept.std
-    kept.lose_scene(64.0)
-    assert kept.std > 60.0
-    kept.find_scene()
-    assert kept.std == before
-
-
 def test_a_place_out_of_the_filters_window_is_not_believed() -> None:
     """In a pan that could not be measured a box that stayed where it was had been reported visible."""
     near, far = Belief(), Belief()
