@@ -216,7 +216,8 @@ class AppearanceTracker:
         if self.certain and (not moving or moved > 0.0):
             # What stands beside something that moves may have slipped off it: nothing is learnt.
             self._parts.confirm(residual, box.centre)
-        ratio += moved
+        # What has just covered the target differs from what was seen there, too, but does not look like it.
+        ratio += moved if ratio > 0.0 else min(moved, 0.0)
         if self._support is not None and np.hypot(*(box.centre - self._support)) < _SUPPORT_WITHIN * self.length:
             ratio += _SUPPORT
         # It can only be there if it is in the filter's window at all.

@@ -12,7 +12,7 @@ from protocols.geometry.types import Floats
 
 _ACCEPT = 2.0  # log odds of a re-detection
 _TENTATIVE = -3.0  # log odds below which a place is not tested further
-_MAX_TESTS = 8  # frames for which a place is tested
+MAX_TESTS = 8  # frames for which a place is tested
 _HITS = 3  # consecutive frames of a re-detection
 _PLACE_STD = 0.05  # of a place measured twice, in target lengths
 KEEPS, _TURNS, _STOPS = 0.75, 0.15, 0.1  # probabilities of what a target has done while away
@@ -104,7 +104,7 @@ class Candidate:
     @property
     def promising(self) -> bool:
         """Whether further frames may make it the target."""
-        return self.evidence > 0.0 and self.log_odds >= _TENTATIVE and self.hits <= _MAX_TESTS
+        return self.evidence > 0.0 and self.log_odds >= _TENTATIVE
 
     @property
     def accepted(self) -> bool:

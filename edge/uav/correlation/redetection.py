@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.uav.base import Image
-from edge.uav.correlation.candidate import KEEPS, Candidate, Kinematics
+from edge.uav.correlation.candidate import KEEPS, MAX_TESTS, Candidate, Kinematics
 from edge.uav.correlation.filter import Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -84,6 +84,8 @@ class Redetection:
         """Search one image; the place that is taken for the target, if any: by its odds, and a margin over the next."""
         self._moving = moving
         self._tested = [c for c in self._tested if self._test(image, c, expected, dt)]
+        if any(c.hits > MAX_TESTS for c in self._tested):
+            self._tested = []  # undecided: the others would have no rival any more
         if not self._tested or self._tested[0].log_odds < _PROMISING or expected.frames % 2 == 0:
             self._search(image, expected, dt)
         kept: list[Candidate] = []
