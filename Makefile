@@ -46,7 +46,7 @@ $(VENV)/.peers: $(STAMP)
 	@touch $@
 
 # How good the answers are: every bench of accuracy in turn.
-benches: $(STAMP)
+benches: $(STAMP) $(VENV)/.peers
 	$(BIN)/python -m tests.bench.every $(if $(QUICK),--quick) --data $(DATA)
 
 # Faults of links, processes, clocks, cameras, disks; enemies with and without certificates: the matrix with its figures.

@@ -1,7 +1,7 @@
 """Any target in any view: cars, boats, bicycles and people in oblique video, also while the camera looks away.
 
     python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique]
-        [--stabilisation] [--json]
+        [--first-seed 0] [--ranges 1,2.5,4] [--stabilisation] [--json]
 
 Rendered oblique flights with truth, and where the data folder has them real ones: whole sequences, and windows that pan
 away from the target for 0.5 to 4 s and come back. No lens, no telemetry.
@@ -31,6 +31,7 @@ from tests.bench.uav_sequences import AWAY_S, Sequence, aerial, oblique, pan_awa
 MODELS = ("ground", *uav_rivals.NAMES)
 NEAR_PX, HELD_FRAMES = 20.0, 20
 _RATES = (10.0, 15.0, 30.0)
+_LEAST_PX = 4.0  # side of a target that the trackers take
 
 
 @dataclass(slots=True)
@@ -111,11 +112,13 @@ def run(sequence: Sequence, model: str) -> Score:
     return score(sequence, estimates, model, 1e3 * (time.process_time() - began) / len(estimates))
 
 
-def flight(target: str, path: str, seed: int, rate: float, away_s: float, frames: int | None = None) -> Sequence:
+def flight(
+    target: str, path: str, seed: int, rate: float, away_s: float, frames: int | None = None, range_factor: float = 1.0
+) -> Sequence:
     """One rendered flight as a sequence."""
     seconds = 2.5 + 1.2 + away_s + 2.5 if path == "away" else 8.0
     count = round(seconds * rate) if frames is None else frames
-    world = ObliqueWorld(target, path, seed, fps=rate, frames=count, away_s=away_s)
+    world = ObliqueWorld(target, path, seed, fps=rate, frames=count, away_s=away_s, range_factor=range_factor)
     pairs = [world.rendered(i) for i in range(count)]
     box = np.array([(t.box.x, t.box.y, t.box.width, t.box.height) for _, t in pairs])
     visible = np.array([t.visible for _, t in pairs])
@@ -125,12 +128,16 @@ def flight(target: str, path: str, seed: int, rate: float, away_s: float, frames
     return Sequence(f"{target} {path} {seed}", kind, images, box[first:], rate, visible[first:])
 
 
-def rendered(seeds: range) -> Iterator[Sequence]:
-    """Rendered flights: every target, every flight, at 10 to 30 frames a second."""
+def rendered(seeds: range, ranges: list[float], kinds: list[str]) -> Iterator[Sequence]:
+    """Rendered flights: every target, every flight, at 10 to 30 frames a second, the factors of the range in turn."""
+    paths = [path for path in FLIGHTS if not kinds or ("rendered away" if path == "away" else "rendered") in kinds]
     for seed in seeds:
         for k, target in enumerate(TARGETS):
-            for path in FLIGHTS:
-                yield flight(target, path, 10 * seed + k, _RATES[(seed + k) % len(_RATES)], AWAY_S[(seed + k) % 4])
+            for path in paths:
+                rate, away_s, factor = (of[(seed + k) % len(of)] for of in (_RATES, AWAY_S, ranges))
+                sequence = flight(target, path, 10 * seed + k, rate, away_s, range_factor=factor)
+                if sequence.box[0, 2:].min() >= _LEAST_PX:
+                    yield sequence
 
 
 def real(data: Path, windows: bool = True) -> Iterator[Sequence]:
@@ -206,6 +213,7 @@ def main() -> None:
     parser.add_argument("--models", default=",".join(MODELS))
     parser.add_argument("--seeds", type=int, default=1, help="rendered flights of each kind")
     parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--ranges", default="1", help="of rendered flights, over the usual range: 4 makes a car 12 px")
     parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
     parser.add_argument("--stabilisation", action="store_true", help="only: how well the real videos are stabilised")
     parser.add_argument("--json", action="store_true")
@@ -222,7 +230,8 @@ def main() -> None:
     kinds = [kind for kind in options.kinds.split(",") if kind]
     sources: list[Iterator[Sequence]] = []
     if not kinds or any(kind.startswith("rendered") for kind in kinds):
-        sources.append(rendered(range(options.first_seed, options.first_seed + options.seeds)))
+        seeds = range(options.first_seed, options.first_seed + options.seeds)
+        sources.append(rendered(seeds, [float(factor) for factor in options.ranges.split(",")], kinds))
     if not kinds or any(not kind.startswith("rendered") for kind in kinds):
         sources.append(real(options.data, not kinds or any("away" in kind for kind in kinds)))
     scores = [

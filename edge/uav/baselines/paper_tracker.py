@@ -17,12 +17,12 @@ from edge.uav.base import Box, Estimate, Hypothesis, Image, Telemetry, TrackStat
 from edge.uav.baselines import histograms, regions
 from edge.uav.baselines.background import BackgroundFilter, BackgroundMotion
 from edge.uav.baselines.car_models import BackgroundAwareModel, FrameObservation, RoadSteeredModel
-from edge.uav.baselines.input_checks import check_image, check_target, has_frame_format, visible_share
 from edge.uav.baselines.plain_tracker import AppearanceTest
 from edge.uav.baselines.road import RoadCourse, RoadMidline, extrapolated_course
 from edge.uav.baselines.road_filter import RoadFilter, line_support
 from edge.uav.baselines.white_lines import EdgeDistance, find_sections
 from edge.uav.prediction import particle_filter as pf
+from edge.uav.target.box import check_target_box, has_frame_format, visible_share
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
@@ -88,8 +88,7 @@ class PaperTracker:
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Learn target, road and regions. Raises InputError for an invalid box or an image of another size."""
-        check_target(target, self.size)
-        check_image(image, self.size)
+        check_target_box(image, self.size, target)
         grey = _grey(image)
         background = BackgroundFilter(self.size, self._rng)
         background.begin(grey, target)

@@ -12,8 +12,8 @@ import numpy as np
 
 from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
 from edge.uav.baselines import histograms
-from edge.uav.baselines.input_checks import check_image, check_target, has_frame_format, visible_share
 from edge.uav.prediction import particle_filter as pf
+from edge.uav.target.box import check_target_box, has_frame_format, visible_share
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
@@ -109,8 +109,7 @@ class PlainTracker:
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Learn the target's histogram. Raises InputError for an invalid box or an image of another size."""
-        check_target(target, self.size)
-        check_image(image, self.size)
+        check_target_box(image, self.size, target)
         longer = max(target.width, target.height)
         centre = np.array([target.x + target.width / 2, target.y + target.height / 2])
         template = histograms.target_histogram(image, target)

@@ -23,6 +23,7 @@ from edge.uav.correlation.scale import BoxFlow, ScaleFilter
 from edge.uav.correlation.search import search, tile
 from edge.uav.correlation.shape import Outline
 from edge.uav.correlation.velocity import VelocityFilter
+from edge.uav.image_motion.residual import MovingParts
 from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
 from edge.uav.target.box import check_target_box
 from protocols.geometry.types import Floats
@@ -33,6 +34,8 @@ _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
+_MOVED = 2.0  # distance within which what moves is looked for, in target lengths
+_STANDS = -0.3  # log likelihood ratio below which a place stands and the target moves
 _WINDOW = 1.2  # half of the region that the filter sees, in target lengths
 _MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
 _UNKNOWN_STEP = 0.1  # std of a step of the scene that could not be measured, over the image's width
@@ -47,8 +50,6 @@ _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
 _TRIAL_SIZES = (0.9, 1.1)
 _SURE_STD = 0.5  # of where it must be since the evidence was clear, in lengths, to go back to that
 _LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
-_KEEP_EVERY = 5  # frames between two keyframes
-_RELOCATE_EVERY = 4  # frames between two attempts to recognise the scene
 
 
 class AppearanceTracker:
@@ -60,7 +61,6 @@ class AppearanceTracker:
         self._scene = SceneMotion(size)
         self.follows = True
         """Whether the other tracker's prediction moves with the scene."""
-        self.debug: dict[str, float] = {}
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
@@ -81,21 +81,17 @@ class AppearanceTracker:
         self._memory.add(image, self.box)
         self._observe_background(image, self.box)
         self._shape = Outline(image, self.box)
-        # On the image that it has learnt a filter answers higher than it will on any other.
-        self._peak = 0.6 * max(self._filter.respond(image, self.box).peak, 0.05)
         self._missed = 0
         self._unseen_s = 0.0
-        self._scene.keep()
-        self._last_sight, self._since_keyframe = (self.box, np.zeros(2)), np.eye(3)
         self._redetection = Redetection(self._size, self._memory, self._respond)
         self._ratio = 0.0
-        self._broken = False  # whether the motion of the scene was unknown in a frame since the last sight
         self._expected: Estimate | None = None
         self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
         self._other_std = np.inf
         self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
         self._belief = Belief()
         self._searching = False
+        self._parts = MovingParts(image, self._time, self.box)
         return self._estimate(time)
 
     def handle_telemetry(self, sample: Telemetry) -> None:
@@ -112,10 +108,11 @@ class AppearanceTracker:
             self._miss(dt)
             return self._estimate(time)
         self.motion = self._scene.update(image, self._outline() if self._missed == 0 else None)
+        place = self.box.centre
         origin = self._predict(dt)
-        self.debug = {}
+        self._parts.update(image, self._time, self.box, self.motion, place, origin)
         if not self._searching:
-            self._track(image, origin, dt)
+            self._track(image, dt)
         else:
             self._look_for(image, dt)
         return self._estimate(time)
@@ -156,8 +153,6 @@ class AppearanceTracker:
         origin = box.centre
         if motion.trusted:
             self._trusted_at = self._time
-            if self._missed == 0:
-                self._since_keyframe = _square(motion.matrix) @ self._since_keyframe
             origin, sure = motion.at(box.centre, self._scene.reach), sure.at(motion.at(sure.centre, self._scene.reach))
             for moving in (self._motion_filter, velocity):
                 moving.follow_scene(motion.matrix[:, :2])
@@ -169,17 +164,10 @@ class AppearanceTracker:
             for moving in (self._motion_filter, velocity):
                 moving.lose_scene(_UNKNOWN_STEP * self._size[0])
         if self._missed:
-            self._broken |= not motion.trusted
             angle = self._turn_rate * dt
             self._motion_filter.turn(angle)
             self._turn_rate *= float(np.exp(-dt / 0.7))
             box = box.turned(angle)
-            # A similarity to the whole scene is coarser than the chain with its parallax, as long as that holds.
-            if self._broken and self._searching and self._missed % _RELOCATE_EVERY == 1:
-                relocated = self._relocated()
-                if relocated is not None:
-                    box, origin, self._broken = relocated, relocated.centre, False
-                    self._motion_filter.find_scene()
         self.box = box.at(origin + self._motion_filter.predict(dt, self.length))
         self._sure = sure.at(sure.centre + velocity.predict(dt, self.length)), velocity
         if expected is not None:
@@ -207,38 +195,36 @@ class AppearanceTracker:
             if not self.motion.trusted:
                 self._sure = self.box, copy(self._motion_filter)
 
-    def _relocated(self) -> OrientedBox | None:
-        """The target's prediction from where it was last seen, in the scene that is now recognised."""
-        matrix = self._scene.relocate()
-        if matrix is None:
-            return None
-        seen, velocity = self._last_sight
-        # From the image of the last sight to the keyframe, and on to this image.
-        matrix = (_square(matrix) @ np.linalg.inv(self._since_keyframe))[:2]
-        linear = matrix[:, :2]
-        self._motion_filter.velocity = linear @ velocity
-        moved = seen.at(linear @ seen.centre + matrix[:, 2] + self._motion_filter.velocity * self._unseen_s)
-        zoom = float(np.sqrt(abs(np.linalg.det(linear))))
-        turn = float(np.arctan2(linear[1, 0], linear[0, 0]))
-        return moved.sized(seen.sides * zoom).turned(turn)
-
-    def _track(self, image: Image, origin: Floats, dt: float) -> None:
+    def _track(self, image: Image, dt: float) -> None:
         """Measure the target about its prediction."""
         if self.box.share_inside(self._size) < _MEASURE_INSIDE:
             self._searching = True  # it leaves the image
             self._miss(dt)
             return
-        box, answer = self._respond(image, self.box)
-        score, peak = self._memory.score(image, box), answer.peak
-        ratio = self._ratio = self._memory.tracking_ratio(score) + answer.log_ratio
+        residual = self._parts.residual(self._time, self.box, _MOVED * self.length)
+        box, score, ratio = self._measured(image, self.box)
+        moving, moved = residual.peaks(box.extent, 2), residual.log_ratio(box.centre)
+        if moved < _STANDS:
+            # It moved, and what is here stands: what moves beside it may be the target.
+            for place in moving:
+                other, *seen = self._measured(image, box.at(place))
+                moves = residual.log_ratio(other.centre)
+                far = float(np.hypot(*(other.centre - self.box.centre))) / self.length
+                if seen[1] + moves - 2.0 * np.log1p(2.0 * far**2) > ratio + moved + _SUPPORT:
+                    box, (score, ratio), moved = other, seen, moves
+        self._ratio = ratio + min(moved, 0.0)  # that something moves is no reason to learn what it looks like
+        if self.certain and (not moving or moved > 0.0):
+            # What stands beside something that moves may have slipped off it: nothing is learnt.
+            self._parts.confirm(residual, box.centre)
+        # What has just covered the target differs from what was seen there, too, but does not look like it.
+        ratio += moved if ratio > 0.0 else min(moved, 0.0)
         if self._support is not None and np.hypot(*(box.centre - self._support)) < _SUPPORT_WITHIN * self.length:
             ratio += _SUPPORT
         # It can only be there if it is in the filter's window at all.
         self._belief.doubt(math.erf(_WINDOW * self.length / self._motion_filter.std / math.sqrt(2.0)) ** 2)
         self._belief.add(ratio, dt)
-        self.debug = {"peak": peak, "ratio": answer.ratio, "score": score, "llr": ratio, "b": self._belief.log_odds}
         if self._belief.visible:
-            self._accept(image, box, score, peak, dt)
+            self._accept(image, box, score, dt)
         else:
             self._searching = self._belief.gone or self._motion_filter.std > self.length
             self._miss(dt)
@@ -247,9 +233,14 @@ class AppearanceTracker:
         elif not self.certain and self._frame % _OBSERVE_DOUBTFUL_EVERY == 0:
             self._observe_rivals(image, box)
 
-    def _accept(self, image: Image, box: OrientedBox, score: float, peak: float, dt: float) -> None:
+    def _measured(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, float, float]:
+        """The target about a box: where, its similarity, and the log likelihood ratio by that and by the filter."""
+        box, answer = self._respond(image, box)
+        score = self._memory.score(image, box)
+        return box, score, self._memory.tracking_ratio(score) + answer.log_ratio
+
+    def _accept(self, image: Image, box: OrientedBox, score: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
-        self._broken = False
         inside = box.share_inside(self._size)
         # Where it looks less like the target than what is beside it, it says little about how the target moves.
         unsure = 1.0 - inside if self._ratio > 0.0 else 1.0
@@ -267,11 +258,7 @@ class AppearanceTracker:
             sides = np.clip(box.sides * factor, self._first / _MAX_GROWTH, self._first * _MAX_GROWTH)
             box = box.sized(np.clip(sides, 4.0, 0.9 * np.array(self._size)))
             if self._ratio > _LEARN_ABOVE and self._belief.log_odds > _CERTAIN:
-                self._learn(image, box, score, peak)
-            if self._frame % _KEEP_EVERY == 0:
-                self._scene.keep()
-                self._since_keyframe = np.eye(3)
-            self._last_sight = box, self._motion_filter.velocity
+                self._learn(image, box, score)
             if self.certain and self._belief.log_odds > _CERTAIN:
                 self._sure = box, copy(self._motion_filter)
         self.box = box
@@ -287,12 +274,12 @@ class AppearanceTracker:
                 return moved.at(moved.centre + [again.x, again.y]), again
         return moved, answer
 
-    def _learn(self, image: Image, box: OrientedBox, score: float, peak: float) -> None:
-        self._filter.learn(image, box, self._memory.agrees(self._memory.first_score(image, box)))
-        if self._frame % 2 == 0:
+    def _learn(self, image: Image, box: OrientedBox, score: float) -> None:
+        if self._frame % 2:
+            self._filter.learn(image, box, self._memory.agrees(float(self._memory.first_scores(image, [box])[0])))
+        else:
             self._scale.learn(image, box)
         self._memory.confirm(score)
-        self._peak += max(0.1, 1.0 / (self._frame + 1.0)) * (peak - self._peak)
         if self._frame % _OBSERVE_EVERY == 0:
             self._memory.add(image, box)
 
@@ -306,9 +293,9 @@ class AppearanceTracker:
         shaped = box.sized(self._first * area)
         trials = [box.turned(-box.angle), shaped, shaped.turned(-box.angle)]
         trials += [box.sized(box.sides * factor) for factor in _TRIAL_SIZES]
-        gains = [self._memory.first_score(image, trial) for trial in trials]
+        now, *gains = self._memory.first_scores(image, [box, *trials])
         best = int(np.argmax(gains))
-        if gains[best] < self._memory.first_score(image, box) + _ANCHOR_GAIN:
+        if gains[best] < now + _ANCHOR_GAIN:
             return box
         aim = trials[best]
         sides = box.sides * (aim.sides / box.sides) ** _ANCHOR_STEP
@@ -346,8 +333,9 @@ class AppearanceTracker:
         """Search for the target where it can be."""
         self._missed += 1
         self._unseen_s += dt
-        found = self._redetection.look(image, self._prediction(), dt)
-        self.debug = self._redetection.debug
+        expected = self._prediction()
+        residual = self._parts.residual(self._time, self.box, 2.0 * expected.wide + self.length)
+        found = self._redetection.look(image, expected, dt, residual)
         if found is not None:
             self._missed, self._unseen_s, self._searching = 0, 0.0, False
             self.box = found.box
@@ -377,8 +365,3 @@ class AppearanceTracker:
         moves = state is not TrackState.LOST and np.hypot(*velocity) > _MOVES * self.length
         heading = float(np.arctan2(velocity[1], velocity[0])) if moves else np.nan
         return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), heading, self.std)
-
-
-def _square(matrix: Floats) -> Floats:
-    """(3, 3) of a map (2, 3)."""
-    return np.vstack([matrix, [0.0, 0.0, 1.0]])

@@ -10,9 +10,9 @@ from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats
 
-_ACCEPT = 1.5  # log odds of a re-detection
+_ACCEPT = 2.0  # log odds of a re-detection
 _TENTATIVE = -3.0  # log odds below which a place is not tested further
-_MAX_TESTS = 8  # frames for which a place is tested
+MAX_TESTS = 8  # frames for which a place is tested
 _HITS = 3  # consecutive frames of a re-detection
 _PLACE_STD = 0.05  # of a place measured twice, in target lengths
 KEEPS, _TURNS, _STOPS = 0.75, 0.15, 0.1  # probabilities of what a target has done while away
@@ -59,6 +59,7 @@ class Candidate:
     expected: Kinematics
     hits: int = 0
     evidence: float = 0.0
+    last: float = 0.0
     origin: Floats | None = None
     moved: Floats = field(default_factory=lambda: np.zeros(2))
     time: float = 0.0
@@ -77,6 +78,7 @@ class Candidate:
         Further frames show the same look-alike, if it is one: they make the evidence surer, not larger.
         """
         self.hits += 1
+        self.last = evidence
         self.evidence += (evidence - self.evidence) / self.hits
         self.box = box
         if self.origin is not None and self.hits > 1:
@@ -102,9 +104,9 @@ class Candidate:
     @property
     def promising(self) -> bool:
         """Whether further frames may make it the target."""
-        return self.evidence > 0.0 and self.log_odds >= _TENTATIVE and self.hits <= _MAX_TESTS
+        return self.evidence > 0.0 and self.log_odds >= _TENTATIVE
 
     @property
     def accepted(self) -> bool:
-        """Whether it is the target."""
-        return self.hits >= _HITS and self.log_odds > _ACCEPT
+        """Whether it is the target, and the last frame shows it."""
+        return self.hits >= _HITS and self.log_odds > _ACCEPT and self.last > 0.0

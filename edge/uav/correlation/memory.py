@@ -60,18 +60,20 @@ class TemplateMemory:
         self._target = _Normal(0.8, 0.15, 4.0, 60.0)
         self._background = _Normal(0.2, 0.2, 2.0, 200.0)
         self._rival = _Normal(0.4, 0.1, 1.0, 6.0)
+        self._spectra: dict[tuple[int, int, int], npt.NDArray[np.complex64]] = {}
         self._tail = np.zeros(_TAIL_BINS)
         self._places = _PLACES
 
     def add(self, image: Image, box: OrientedBox) -> None:
         """Consider the box as a new template."""
-        new = vector(image, box)
+        new = vectors(image, [box])[0]
         if self._templates:
             similarity = np.array([float(t @ new) for t in self._templates])
             if similarity.max() > _NEW_BELOW or not self.agrees(float(similarity[0])):
                 return
         self._templates.append(new)
         self._used.append(self._count)
+        self._spectra.clear()
         if len(self._templates) > _MAX_TEMPLATES:
             oldest = 1 + int(np.argmin(self._used[1:]))
             del self._templates[oldest], self._used[oldest]
@@ -82,15 +84,18 @@ class TemplateMemory:
 
     def score(self, image: Image, box: OrientedBox) -> float:
         """Similarity (-1 to 1) of the box to the most similar template."""
-        self._count += 1
-        similarity = np.array(self._templates) @ vector(image, box)
-        best = int(similarity.argmax())
-        self._used[best] = self._count
-        return float(similarity[best])
+        return float(self.scores(image, [box])[0])
 
-    def first_score(self, image: Image, box: OrientedBox) -> float:
-        """Similarity of the box to the first template."""
-        return float(self._templates[0] @ vector(image, box))
+    def scores(self, image: Image, boxes: list[OrientedBox]) -> Floats:
+        """Similarities (n,) of boxes to the most similar template; the best box's template counts as used."""
+        self._count += 1
+        similarity = np.array(self._templates) @ vectors(image, boxes).T
+        self._used[int(similarity.max(axis=1).argmax())] = self._count
+        return np.asarray(similarity.max(axis=0), np.float64)
+
+    def first_scores(self, image: Image, boxes: list[OrientedBox]) -> Floats:
+        """Similarities (n,) of boxes to the first template."""
+        return np.asarray(vectors(image, boxes) @ self._templates[0], np.float64)
 
     def scan(self, features: Features) -> Floats:
         """Scores (h - 5, w - 5) of all boxes of 6x6 cells of a feature map (12, h, w)."""
@@ -107,12 +112,20 @@ class TemplateMemory:
         spectrum = scipy.fft.rfft2(planes, s=shape)
         best = np.full(norm.shape, -1.0)
         for template in self._scanned():
-            cells = template.reshape(len(features), CELLS, CELLS)
-            product = (spectrum * np.conj(scipy.fft.rfft2(cells, s=shape))).sum(axis=0)
+            product = (spectrum * self._spectrum(template, shape)).sum(axis=0)
             raw = scipy.fft.irfft2(product, s=shape)[valid]
-            raw = raw - _CENTRED * np.tensordot(cells.sum(axis=(1, 2)), mean, 1)
+            sums = template.reshape(len(features), -1).sum(axis=1)
+            raw = raw - _CENTRED * np.tensordot(sums, mean, 1)
             np.maximum(best, raw / norm, out=best)
         return best
+
+    def _spectrum(self, template: Features, shape: tuple[int, int]) -> npt.NDArray[np.complex64]:
+        """Conjugate spectrum of a template's planes, padded to ``shape``; kept, for regions of few shapes recur."""
+        key = (id(template), *shape)
+        if key not in self._spectra:
+            cells = template.reshape(-1, CELLS, CELLS)
+            self._spectra[key] = np.asarray(np.conj(scipy.fft.rfft2(cells, s=shape)), np.complex64)
+        return self._spectra[key]
 
     def _scanned(self) -> list[Features]:
         """The first template and those that matched last."""
@@ -174,10 +187,11 @@ def _weighted(features: Features) -> Features:
     return out
 
 
-def vector(image: Image, box: OrientedBox) -> npt.NDArray[np.float32]:
-    """Unit vector (432,) of a box: its cells, each channel partly without its mean."""
-    patch = crop(image, box.sized(box.sides * (SIDE + 8) / SIDE), (SIDE + 8, SIDE + 8))
-    features = _weighted(cell_features(patch, CELL_PX))[:, 1:-1, 1:-1].reshape(-1, CELLS * CELLS)
-    features = features - _CENTRED * features.mean(axis=1, keepdims=True)
-    flat = features.reshape(-1)
-    return np.asarray(flat / (np.linalg.norm(flat) + 1e-6), np.float32)
+def vectors(image: Image, boxes: list[OrientedBox]) -> npt.NDArray[np.float32]:
+    """Unit vectors (n, 432) of boxes: their cells, each channel partly without its mean."""
+    side = SIDE + 2 * CELL_PX  # a cell around, which the features of the outer cells need
+    patches = np.concatenate([crop(image, box.sized(box.sides * side / SIDE), (side, side)) for box in boxes])
+    cells = _weighted(cell_features(patches, CELL_PX)).reshape(-1, len(boxes), CELLS + 2, CELLS + 2)
+    features = cells[:, :, 1:-1, 1:-1].transpose(1, 0, 2, 3).reshape(len(boxes), -1, CELLS * CELLS)
+    flat = (features - _CENTRED * features.mean(axis=2, keepdims=True)).reshape(len(boxes), -1)
+    return np.asarray(flat / (np.linalg.norm(flat, axis=1, keepdims=True) + 1e-6), np.float32)

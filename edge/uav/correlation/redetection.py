@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.uav.base import Image
-from edge.uav.correlation.candidate import KEEPS, Candidate, Kinematics
+from edge.uav.correlation.candidate import KEEPS, MAX_TESTS, Candidate, Kinematics
 from edge.uav.correlation.filter import Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
-from edge.uav.correlation.search import search, tile
+from edge.uav.correlation.search import Found, search, tile
+from edge.uav.image_motion.residual import UNKNOWN, Residual
 from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats
 
@@ -23,12 +24,15 @@ _PROPOSED = 1.0  # log prior of a place that another tracker has found
 _PROMISING = 0.0  # log odds of a place under test above which others are searched about the prediction only
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
 _MOST_TESTED, _RIVAL_MARGIN = 2, 2.0  # places that are tested at once; log odds within which one is a rival
+_OUTSIDE = 2.0  # log odds that a place must exceed, with the margin, while the target is surely beyond the border
+_MOST_MOVING = 2  # places at which something moves that are looked at, a search
 _DETECTION = 0.25  # probability that one search finds a target in view
 _HIDDEN = 0.1  # probability that it is in view, but behind something, for as long as it is away
 _CHANGE = 0.1  # std of the similarity of a target that has been away
 _MIN_INSIDE = 0.6  # share of a place in the image
 _TRIAL_SIZES = (0.9, 1.1)
 _FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
+_TRIAL_TURNS, _FIRST_TURNS = (-0.1, 0.1), (-0.36, -0.18, 0.18, 0.36)  # [rad]
 _SIZES = (1.0, 0.87, 1.15, 0.75, 1.33)
 _UPRIGHT = float("nan")  # as in the first image, however it had turned: most targets only seem to turn
 _ANGLES = (0.0, _UPRIGHT, 0.35, 0.0, -0.35, _UPRIGHT, 0.7, 0.0, -0.7, _UPRIGHT, 1.1, 0.0, -1.1, _UPRIGHT, 1.57)
@@ -60,7 +64,7 @@ class Redetection:
         self._near = 1.0
         self._inside, self._unnoticed = 0.0, 1.0  # probability that it is in the image, and that it was not seen there
         self._tested: list[Candidate] = []
-        self.debug: dict[str, float] = {}
+        self._moving = UNKNOWN
 
     def move(self, motion: Motion, reach: float, dt: float) -> None:
         """Predict the places under test into the next frame."""
@@ -76,20 +80,26 @@ class Redetection:
         if not same:
             self._tested.append(Candidate(box, prior, expected.motion))
 
-    def look(self, image: Image, expected: Prediction, dt: float) -> Candidate | None:
+    def look(self, image: Image, expected: Prediction, dt: float, moving: Residual = UNKNOWN) -> Candidate | None:
         """Search one image; the place that is taken for the target, if any: by its odds, and a margin over the next."""
-        self.debug = {}
+        self._moving = moving
         self._tested = [c for c in self._tested if self._test(image, c, expected, dt)]
+        if any(c.hits > MAX_TESTS for c in self._tested):
+            self._tested = []  # undecided: the others would have no rival any more
         if not self._tested or self._tested[0].log_odds < _PROMISING or expected.frames % 2 == 0:
             self._search(image, expected, dt)
-        self._tested.sort(key=lambda c: -c.log_odds)
-        del self._tested[_MOST_TESTED:]
+        kept: list[Candidate] = []
+        for candidate in sorted(self._tested, key=lambda c: -c.log_odds):
+            if not any(c.covers(candidate.box) for c in kept):  # two that came to one place are no rivals
+                kept.append(candidate)
+        self._tested = kept[:_MOST_TESTED]
         if not self._tested:
             return None
         best = self._tested[0]
         others = [c.log_odds for c in self._tested[1:]]
-        self.debug |= {"sum": best.log_odds, "next": max(others, default=-99.0), "near": self._near}
-        return best if best.accepted and best.log_odds > max(others, default=-np.inf) + _MARGIN else None
+        # While it is beyond the border, each search is another chance for what only looks like it.
+        least = max(0.0, _OUTSIDE * (1.0 - expected.box.probability_inside(expected.std, self._size)), *others)
+        return best if best.accepted and best.log_odds > least + _MARGIN else None
 
     def _search(self, image: Image, expected: Prediction, dt: float) -> None:
         """Take up the likeliest new place: in turn about the prediction, and in one tile after the other."""
@@ -101,11 +111,17 @@ class Redetection:
             box, reach = tile(box, self._size, turn)
         else:
             self._find_nothing(expected)
-        new = [f for f in search(image, self._memory, box, reach) if not any(c.covers(f.box) for c in self._tested)]
+        found = search(image, self._memory, box, reach)
+        moving = [box.at(place) for place in self._moving.peaks(box.extent, _MOST_MOVING)]
+        found += [Found(place, self._memory.score(image, place)) for place in moving]
+        new = [f for f in found if not any(c.covers(f.box) for c in self._tested)]
         if not new:
             return
         priors = [self._log_prior(f.box.centre, expected) for f in new]
-        odds = [self._memory.log_ratio(f.score, _CHANGE) + prior for f, prior in zip(new, priors, strict=True)]
+        odds = [
+            self._memory.log_ratio(f.score, _CHANGE) + prior + self._moving.log_ratio(f.box.centre)
+            for f, prior in zip(new, priors, strict=True)
+        ]
         order = np.argsort(odds)[::-1]
         for k in order[:_MOST_TESTED]:
             # A rival that is about as likely is tested beside the likeliest one.
@@ -138,17 +154,18 @@ class Redetection:
     def _test(self, image: Image, candidate: Candidate, expected: Prediction, dt: float) -> bool:
         """Add a frame's evidence to a place; whether it may still be the target."""
         box, answer = self._localise(image, candidate.box)
+        sizes, turns = (_TRIAL_SIZES, _TRIAL_TURNS) if candidate.hits else (_FIRST_SIZES, _FIRST_TURNS)
         if candidate.hits == 0:
             # Before another size or angle is believed: the last one, localised about the same place.
             same, same_answer = self._localise(image, expected.box.at(candidate.box.centre))
             if self._memory.score(image, same) > self._memory.score(image, box):
                 box, answer = same, same_answer
-        trials = [box, *(box.sized(f * box.sides) for f in (_TRIAL_SIZES if candidate.hits else _FIRST_SIZES))]
-        scores = [self._memory.score(image, trial) for trial in trials]
-        score, box = max(scores), trials[int(np.argmax(scores))]
+        trials = [box, *(box.sized(f * box.sides) for f in sizes), *(box.turned(angle) for angle in turns)]
+        scores = self._memory.scores(image, trials)
+        score, box = float(scores.max()), trials[int(scores.argmax())]
         evidence = self._memory.log_ratio(score, _CHANGE, answer.log_ratio)
+        evidence += self._moving.log_ratio(box.centre)
         candidate.add(box, evidence, dt)
-        self.debug |= {"score": score, "llr": evidence, "ratio": answer.ratio, "prior": candidate.prior}
         return candidate.promising and box.share_inside(self._size) > _MIN_INSIDE
 
 

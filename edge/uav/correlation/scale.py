@@ -12,7 +12,9 @@ import numpy.typing as npt
 
 from edge.uav.base import Image
 from edge.uav.correlation.features import cell_features
+from edge.uav.correlation.filter import refined
 from edge.uav.correlation.oriented_box import OrientedBox, crop
+from edge.uav.image_motion.scene_motion import middle
 from protocols.geometry.types import Floats
 
 _FLOW_PX = 72  # longer side of the resampled box [px]
@@ -76,16 +78,16 @@ class BoxFlow:
 
 def _slope(old: Floats, new: Floats, axis: int) -> tuple[float, float]:
     """Robust derivatives of one new coordinate by the same and by the other old one, with a prior of 1 and 0."""
-    spread = np.square(old - np.median(old, axis=0)).mean(axis=0)
+    spread = old.var(axis=0)
     step: Floats = np.zeros(2)
     weight: Floats = np.ones(len(old))
     for _ in range(3):
         change = new - old[:, axis]
         residual = change - old @ step
-        residual = residual - np.average(residual, weights=weight)
-        scale = max(float(np.median(np.abs(residual))), 0.1)
+        residual = residual - weight @ residual / weight.sum()
+        scale = max(middle(np.abs(residual)), 0.1)
         weight = np.asarray(1.0 / (1.0 + np.square(residual / (2.0 * scale))), np.float64)
-        centred = old - np.average(old, axis=0, weights=weight)
+        centred = old - weight @ old / weight.sum()
         normal = centred.T @ (weight[:, None] * centred) + np.diag(_FLOW_PRIOR * spread + 1e-6)
         step = np.asarray(np.linalg.solve(normal, centred.T @ (weight * change)), np.float64)
     slope = float(np.clip(1.0 + step[axis], 1.0 / _MAX_STEP, _MAX_STEP))
@@ -124,11 +126,8 @@ class ScaleFilter:
         product = (np.conj(self._numerator) * spectrum).sum(axis=0) / (self._denominator + regular)
         answer = np.fft.fftshift(np.fft.irfft(product, n=_SCALES))
         k = int(answer.argmax())
-        at = float(self._steps[k])
-        if 0 < k < _SCALES - 1:
-            left, mid, right = answer[k - 1], answer[k], answer[k + 1]
-            at += float(np.clip(0.5 * (left - right) / min(left - 2 * mid + right, -1e-9), -0.5, 0.5))
-        return float(_STEP**at)
+        between = refined(answer, k) if 0 < k < _SCALES - 1 else 0.0
+        return float(_STEP ** (self._steps[k] + between))
 
     def _spectrum(self, image: Image, box: OrientedBox) -> npt.NDArray[np.complex128]:
         stack = np.concatenate([crop(image, box.sized(box.sides * f), (_SIDE, _SIDE)) for f in self._factors], axis=0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from edge.uav.base import Image
 from edge.uav.correlation.features import cell_features
-from edge.uav.correlation.memory import CELL_PX, CELLS, SIDE, TemplateMemory
+from edge.uav.correlation.memory import CELL_PX, CELLS, TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox, crop
 from protocols.geometry.types import Floats
 
@@ -85,6 +85,3 @@ def tile(box: OrientedBox, size: tuple[int, int], index: int) -> tuple[OrientedB
     step = np.array(size) / counts
     middle = (np.array([k % counts[0], k // counts[0]]) + 0.5) * step
     return box.at(middle), 0.5 * step + 0.2 * box.extent
-
-
-__all__ = ["SIDE", "Found", "search", "tile"]

@@ -47,10 +47,6 @@ class VelocityFilter:
         """The motion of the scene is unknown in one frame: std of it, one coordinate [px]."""
         self._scene += std**2
 
-    def find_scene(self) -> None:
-        """The scene was recognised."""
-        self._scene = 0.0
-
     def turn(self, angle: float) -> None:
         """Turn the velocity by ``angle`` [rad]."""
         c, s = np.cos(angle), np.sin(angle)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from edge.uav.correlation.filter import refined
 from edge.uav.ground.image_plane import ImagePlane, apply_homography
 from protocols.geometry.types import Floats
 
@@ -386,15 +387,5 @@ def _masked_correlation(field: Singles, valid: Singles, template: Singles) -> Si
 def _subcell(score: Singles, row: int, column: int) -> tuple[float, float]:
     """Offset of the maximum from its cell, by a parabola along each axis, within half a cell."""
     height, width = score.shape
-    dx = dy = 0.0
-    if 0 < column < width - 1:
-        left, middle, right = (float(score[row, column + k]) for k in (-1, 0, 1))
-        curvature = left - 2 * middle + right
-        if curvature < -1e-6:
-            dx = float(np.clip(0.5 * (left - right) / curvature, -0.5, 0.5))
-    if 0 < row < height - 1:
-        up, middle, down = (float(score[row + k, column]) for k in (-1, 0, 1))
-        curvature = up - 2 * middle + down
-        if curvature < -1e-6:
-            dy = float(np.clip(0.5 * (up - down) / curvature, -0.5, 0.5))
-    return dx, dy
+    dx = refined(score[row], column) if 0 < column < width - 1 else 0.0
+    return dx, refined(score[:, column], row) if 0 < row < height - 1 else 0.0

@@ -1,4 +1,4 @@
-"""Validation of a target bounding box that a user drew."""
+"""Validation of a target bounding box that a user drew, and of frames; visible share of a box."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MIN_INSIDE_SHARE = 0.3  # share of the box
 def check_target_box(image: Image, size: tuple[int, int], target: Box) -> None:
     """Raises InputError for a box that cannot be a target, or for an image of another size."""
     width, height = size
-    if image.ndim != 3 or image.shape[:2] != (height, width):
+    if not has_frame_format(image, size):
         raise InputError(f"an image of {image.shape[1]}x{image.shape[0]}, not {width}x{height}", remedy="check --rig")
     values = (target.x, target.y, target.width, target.height)
     text = ",".join(f"{value:g}" for value in values)
@@ -23,11 +23,21 @@ def check_target_box(image: Image, size: tuple[int, int], target: Box) -> None:
     if min(target.width, target.height) < _MIN_BOX_PX:
         remedy = f"draw a box of at least {_MIN_BOX_PX:g} pixels a side round the car"
         raise InputError(f"target {text} is too small to be recognised", remedy=remedy)
-    overlap_x = min(target.x + target.width, width) - max(target.x, 0.0)
-    overlap_y = min(target.y + target.height, height) - max(target.y, 0.0)
-    if min(overlap_x, overlap_y) <= 0 or overlap_x * overlap_y < _MIN_INSIDE_SHARE * target.width * target.height:
+    if visible_share(target.x + target.width / 2, target.y + target.height / 2, target, size) < _MIN_INSIDE_SHARE:
         raise InputError(
             f"target {text} is outside the image of {width}x{height}", remedy="give x,y,w,h of a car in the image"
         )
     if target.width * target.height > 0.5 * width * height:
         raise InputError(f"target {text} fills the image", remedy="draw the box round one target")
+
+
+def has_frame_format(image: Image, size: tuple[int, int]) -> bool:
+    """Whether it is a BGR image (h, w, 3) of bytes of the given size (w, h)."""
+    return image.shape == (size[1], size[0], 3) and image.dtype == np.uint8
+
+
+def visible_share(x: float, y: float, box: Box, size: tuple[int, int]) -> float:
+    """The share, 0..1, of a box of box's size about (x, y) that lies in an image of size (w, h)."""
+    wide = min(x + box.width / 2, size[0]) - max(x - box.width / 2, 0.0)
+    high = min(y + box.height / 2, size[1]) - max(y - box.height / 2, 0.0)
+    return max(wide, 0.0) * max(high, 0.0) / (box.width * box.height)

@@ -11,7 +11,6 @@ from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.filter import CorrelationFilter, windowed
 from edge.uav.correlation.oriented_box import OrientedBox, crop
 from edge.uav.correlation.scale import BoxFlow
-from edge.uav.image_motion.keyframe import Keyframe
 from edge.uav.image_motion.scene_motion import STILL, SceneMotion
 from edge.uav.tracker_factory import make_tracker
 from edge.uav.world.oblique.world import ObliqueWorld
@@ -160,16 +159,6 @@ def test_what_another_tracker_finds_is_taken_up_where_it_looks_like_the_target(s
 def test_what_another_tracker_finds_is_not_the_target_where_it_looks_otherwise(scene: Image) -> None:
     images, truth = flight(scene, away=420.0, shown_again=False)
     assert not any(e.state is TrackState.VISIBLE for e in follow_with_another(images, truth, 0.0)[30:])
-
-
-def test_a_scene_is_recognised_after_a_cut(scene: Image) -> None:
-    gray = cv2.cvtColor(scene, cv2.COLOR_BGR2GRAY)
-    matrix = Keyframe(np.ascontiguousarray(gray[200:440, 150:470])).locate(np.ascontiguousarray(gray[230:470, 240:560]))
-    assert matrix is not None
-    assert np.abs(matrix @ [160.0, 120.0, 1.0] - [70.0, 90.0]).max() < 1.0
-    assert (
-        Keyframe(np.ascontiguousarray(gray[0:240, 0:320])).locate(np.ascontiguousarray(gray[400:640, 900:1220])) is None
-    )
 
 
 def test_zoom_and_turn_of_an_oblique_flight_are_measured_among_moving_cars() -> None:

@@ -12,13 +12,14 @@ from edge.uav.adaptive_tracker import AdaptiveTracker
 from edge.uav.base import Basis, Box, Estimate, Image, TrackState
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.belief import Belief
-from edge.uav.correlation.candidate import Kinematics
+from edge.uav.correlation.candidate import Candidate, Kinematics
 from edge.uav.correlation.filter import Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.correlation.redetection import Prediction, Redetection
 from edge.uav.correlation.velocity import VelocityFilter
-from edge.uav.image_motion.scene_motion import SceneMotion
+from edge.uav.image_motion.residual import MovingParts, Residual
+from edge.uav.image_motion.scene_motion import Motion, SceneMotion
 
 SIZE = (320, 240)
 FPS = 15.0
@@ -114,15 +115,6 @@ def test_what_moves_is_predicted_less_surely_than_what_stands() -> None:
     assert stds[1] > 1.8 * stds[0]
 
 
-def test_a_scene_that_is_recognised_again_ends_the_doubt_about_where_it_is() -> None:
-    kept = VelocityFilter(20.0)
-    before = kept.std
-    kept.lose_scene(64.0)
-    assert kept.std > 60.0
-    kept.find_scene()
-    assert kept.std == before
-
-
 def test_a_place_out_of_the_filters_window_is_not_believed() -> None:
     """In a pan that could not be measured a box that stayed where it was had been reported visible."""
     near, far = Belief(), Belief()
@@ -151,3 +143,78 @@ def test_where_the_ground_has_lost_the_target_the_appearance_answers(
     assert found.state is TrackState.VISIBLE
     assert found.basis in (Basis.STABILISED, Basis.IMAGE)
     assert abs(found.x - place[0]) < 3.0
+
+
+def watched(scene: Image, step: float, follows: bool = True) -> tuple[MovingParts, Residual, np.ndarray]:
+    """A second in which the camera travels 4 px a frame and the target ``step`` over the scene: what moves, and where.
+
+    follows: whether the tracker's box stays on the target; else on the scene where it was at first.
+    """
+    camera, start, side = np.array([4.0, 0.0]), np.array([120.0, 120.0]), 0.5 * TARGET
+    motion = Motion(np.array([[1.0, 0.0, -4.0], [0.0, 1.0, 0.0]]), np.zeros((0, 2)), np.zeros((0, 2)), True, 1.0)
+
+    def image(k: int) -> Image:
+        shown = np.ascontiguousarray(scene[100 : 100 + SIZE[1], 200 + 4 * k : 200 + 4 * k + SIZE[0]])
+        place = start + k * (np.array([step, 0.0]) - camera)
+        low, high = np.rint(place - side).astype(int).tolist(), np.rint(place + side).astype(int).tolist()
+        cv2.rectangle(shown, low, high, (30, 40, 220), -1)
+        return shown
+
+    box = OrientedBox(*start, *map(float, TARGET))
+    parts = MovingParts(image(0), 0.0, box)
+    for k in range(1, 15):
+        origin = box.centre - camera
+        parts.update(image(k), k / FPS, box, motion, box.centre, origin)
+        box = box.at(origin + ([step, 0.0] if follows else [0.0, 0.0]))
+        residual = parts.residual(k / FPS, box, 60.0)
+        if follows:
+            parts.confirm(residual, box.centre)
+    return parts, residual, start + 14 * (np.array([step, 0.0]) - camera)
+
+
+def test_what_moves_over_the_stabilised_scene_is_evidence_for_a_target_that_moves(scene: Image) -> None:
+    _, residual, place = watched(scene, 3.0)
+    assert residual.log_ratio(place) > 1.0
+    assert residual.log_ratio(place + [0.0, 40.0]) < -1.0  # the scene beside it, though the camera travels
+    assert min(np.hypot(*(peak - place)) for peak in residual.peaks(TARGET, 2)) < 15.0
+
+
+def test_for_a_target_that_stands_what_moves_is_no_evidence(scene: Image) -> None:
+    _, residual, place = watched(scene, 0.0)
+    assert residual.moves < 0.3
+    assert abs(residual.log_ratio(place)) < 0.5
+    assert residual.peaks(TARGET, 2) == []
+
+
+def test_that_the_target_moves_is_learnt_where_it_was_at_first(scene: Image) -> None:
+    """A box that slips off at once on to what stands would else teach that the target stands."""
+    _, residual, _ = watched(scene, 5.0, follows=False)
+    assert residual.moves > 0.6
+    assert residual.log_ratio(np.array([120.0 - 56.0, 120.0])) < 0.0  # where the box is
+
+
+def test_while_the_target_is_beyond_the_border_a_place_needs_higher_odds() -> None:
+    """Each search of an image that does not show it is another chance for what only looks like it."""
+    image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    found = []
+    for x in (160.0, -60.0):
+        search, expected = redetection(), prediction(x)
+        candidate = Candidate(OrientedBox(160.0, 120.0, 30.0, 20.0), 0.0, expected.motion, 5, 2.5, 2.5)
+        search._tested = [candidate]
+        search._test = lambda *of: True  # type: ignore[method-assign]
+        search._search = lambda *of: None  # type: ignore[method-assign]
+        found.append(search.look(image, expected, 1.0 / FPS))
+    assert found[0] is not None
+    assert found[1] is None
+
+
+def test_two_places_under_test_that_come_to_one_are_no_rivals() -> None:
+    """Both had settled on the target: neither had a margin over the other for a second and a half."""
+    search, expected = redetection(), prediction(160.0)
+    search._tested = [
+        Candidate(OrientedBox(x, 120.0, 30.0, 20.0), prior, expected.motion, 5, 6.0, 6.0)
+        for x, prior in ((160.0, -0.2), (161.0, -0.5))
+    ]
+    search._test = lambda *of: True  # type: ignore[method-assign]
+    search._search = lambda *of: None  # type: ignore[method-assign]
+    assert search.look(np.zeros((SIZE[1], SIZE[0], 3), np.uint8), expected, 1.0 / FPS) is not None
