@@ -59,7 +59,7 @@ def adjust(
 ) -> tuple[Problem, AdjustmentState, SmoothnessPrior]:
     """Solve: robust rounds first, then the inliers with full weight.
 
-    coarse: stop early, for an initial estimate that is adjusted again.
+    coarse: leave out the last, fine round, for an initial estimate that is adjusted again.
     Returns the problem with inliers marked, the state, and the motion prior used.
     """
     prior = estimate_smoothness(problem, state, weak=True)
@@ -76,10 +76,10 @@ def adjust(
             robust = False
         if progress is not None:
             progress(f"adjustment {round_index + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
-    state = _minimise(
-        problem, state, prior, robust, iterations, _COARSE_TOLERANCE if coarse else _FINE_TOLERANCE, steps, coarse
-    )
-    return problem, replace(state, sigma=estimate_noise(problem, state), steps=tuple(steps)), prior
+    if not coarse:
+        state = _minimise(problem, state, prior, robust, iterations, _FINE_TOLERANCE, steps, coarse)
+        state = replace(state, sigma=estimate_noise(problem, state))
+    return problem, replace(state, steps=tuple(steps)), prior
 
 
 def estimate_noise(problem: Problem, state: AdjustmentState) -> Floats:
@@ -238,6 +238,7 @@ def _minimise(
     )
     pixels = float(np.sqrt(np.mean(state.sigma**2)))
     steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / residual_count))))
+    last_gain = 0.0
     for _ in range(iterations):
         system = system or assemble(problem, state, prior, current)
         try:
@@ -252,8 +253,10 @@ def _minimise(
             state, current, cost, system = trial, trial_residuals, trial_residuals.cost, None
             steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / residual_count))))
             damping = max(damping / 10.0, 1e-12)
-            if gain < tolerance * cost:
+            # Near the minimum each step gains the same share of the last one's gain: what the next would.
+            if gain * gain / max(gain, last_gain) < tolerance * cost:
                 break
+            last_gain = gain
         else:
             damping = max(damping * 10.0, 1e-8)
             if damping > 1e6:
