@@ -27,6 +27,7 @@ from protocols.session.result import result_document
 from protocols.session.rig import Rig, RigCamera
 from tests.bench import broken_cameras
 from tests.bench.pose_worlds import FOCAL, cube, errors, joint_optimum, observe, section_4
+from tests.bench.simulated_rigs import make_rallies
 from tests.support import rigs
 
 DRONE2 = Path(__file__).parents[4] / "shared" / "data" / "drone2"
@@ -219,6 +220,16 @@ def test_a_readout_is_neither_negative_nor_longer_than_a_frame(four: tuple[rigs.
     for readout, plausible in ((0.5 * interval, True), (-0.044, False), (1.5 * interval, False)):
         read = tuple(replace(camera, readout=readout) for camera in state.cameras)
         assert model_comparison.are_readouts_plausible(problem, replace(state, cameras=read)) == plausible
+
+
+def test_rallies_of_table_tennis_keep_all_cameras_and_invent_no_readout() -> None:
+    path = make_rallies(np.random.default_rng([703, 5]))
+    session = rigs.simulate(703, 4, float(path.ends[-1]) + 1.0, fps=(60.0,), late=0.5, path=path)
+    found = calibrate(session.rig, session.observations(), thorough=True)
+    assert not found.refused
+    for name, camera in found.cameras.items():
+        assert 0.0 <= camera.readout <= 1.0 / 60.0
+        assert abs(session.clock_error(name, found.reference, camera.time_map)) < 1e-3
 
 
 def test_the_lag_is_stated_in_the_middle_of_the_shared_span(four: tuple[rigs.Session, Calibration]) -> None:
