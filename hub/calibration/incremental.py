@@ -28,7 +28,7 @@ from hub.bundle.problem import CameraState, FreeParameters
 from hub.calibration.acceptance import least_certain_camera, misfits
 from hub.calibration.pair_network import expected_lag, solve_new_pairs
 from hub.calibration.pair_overlap import LARGE_NETWORK
-from hub.calibration.pipeline import MAX_CLOCK_STEPS, bic_prefers, calibrate, final_adjustment
+from hub.calibration.pipeline import MAX_CLOCK_STEPS, STEP_PARAMETERS, bic_prefers, calibrate, final_adjustment
 from hub.calibration.resection_scan import scan_resection
 from hub.calibration.result import assemble_calibration
 from hub.calibration.self_calibration import focal_prior, with_cameras, with_lens
@@ -211,7 +211,7 @@ def _clock_step(
     """
     problem, state = reconstruction.problem, reconstruction.state
     tested = model_comparison.with_rows_of_a_step(problem, state)
-    found, new = model_comparison.find_clock_step(tested, state, against_lenses=True), 1
+    found, new = model_comparison.find_clock_step(tested, state), STEP_PARAMETERS
     for name in () if found is not None else [name for name in reconstruction.names if name in steps]:
         scale, origin = prepared.time_scale(name), prepared.time_origins[name]
         for step in steps[name]:
