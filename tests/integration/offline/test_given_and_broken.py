@@ -25,7 +25,7 @@ from protocols.session.folder import read_folder
 from protocols.session.observations import gather_tracks
 from protocols.session.result import result_document
 from protocols.session.rig import Rig, RigCamera
-from tests.bench import broken_cameras
+from tests.bench import broken_cameras, lasting_errors
 from tests.bench.pose_worlds import FOCAL, cube, errors, joint_optimum, observe, section_4
 from tests.bench.simulated_rigs import make_rallies
 from tests.support import rigs
@@ -184,6 +184,14 @@ def test_a_clock_step_is_reported_with_time_and_size_and_no_other_clock_follows(
     for name, camera in found.cameras.items():
         assert camera.readout == 0.0
         assert abs(session.clock_error(name, found.reference, camera.time_map)) <= 5.0 * camera.time_offset_std
+
+
+def test_slow_errors_of_labels_and_of_lenses_are_no_clock_step() -> None:
+    """Errors that last for seconds, in a part of a flight, of lenses that are up to 2 % off."""
+    one = lasting_errors.session(9102)
+    found = calibrate(one.rig, one.observations)
+    assert len(found.cameras) == 4
+    assert not any(camera.clock_steps for camera in found.cameras.values())
 
 
 @pytest.mark.skipif(not DRONE2.is_dir(), reason="no recording in ../shared/data")
