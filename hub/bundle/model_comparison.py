@@ -228,8 +228,11 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     step like a rolling shutter of all cameras. So all lenses and readouts are free too, as far as is plausible, and the
     step has to explain what they do not.
     """
+    if not problem.free_parameters.clock:
+        return None
+    problem = _with_rows_of_a_step(problem, state)
     inflation = correlation_inflation(problem, state)
-    if not problem.free_parameters.clock or inflation.max() < _MIN_STEP_INFLATION:
+    if inflation.max() < _MIN_STEP_INFLATION:
         return None
     # A camera that steps has the most correlated residuals of all, for that reason: here it must not count for less.
     linear, trials = _Linearised.of(problem, state, state.sigma * np.sqrt(np.median(inflation))), []
@@ -239,7 +242,7 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
         used = [part.time[part.use] for part in problem.rows if part.camera == camera]
         times = np.unique(np.concatenate([np.zeros(0), *used]))
         if len(times) >= _MIN_STEP_ROWS:
-            first, last, width = 0.05 * len(times), 0.95 * (len(times) - 1), 0.9 * len(times) / (_STEP_TIMES - 1)
+            first, last, width = 0.05 * (len(times) - 1), 0.95 * (len(times) - 1), 0.9 * len(times) / (_STEP_TIMES - 1)
             trial = linear.best_step(camera, times[np.linspace(first, last, _STEP_TIMES).astype(int)])[0]
             near = np.searchsorted(times, trial.time) + width * np.linspace(-1.0, 1.0, _STEP_TIMES)
             trials.append((trial, times[np.clip(near, 1, len(times) - 1).astype(int)]))
@@ -280,7 +283,7 @@ def _with_its_noise(
     return replace(step, statistic=float(effective * np.log1p(step.statistic / effective)))
 
 
-def with_rows_of_a_step(problem: Problem, state: AdjustmentState) -> Problem:
+def _with_rows_of_a_step(problem: Problem, state: AdjustmentState) -> Problem:
     """The problem with all rows in use whose residuals a step of at most `_MAX_STEP_S` could explain.
 
     A state that is adjusted robustly to many rows rejects the few after a step as outliers.

@@ -210,8 +210,7 @@ def _clock_step(
     First one that is not known; then what is left of a known one, where that is more than its std.
     """
     problem, state = reconstruction.problem, reconstruction.state
-    tested = model_comparison.with_rows_of_a_step(problem, state)
-    found, new = model_comparison.find_clock_step(tested, state), STEP_PARAMETERS
+    found, new = model_comparison.find_clock_step(problem, state), STEP_PARAMETERS
     for name in () if found is not None else [name for name in reconstruction.names if name in steps]:
         scale, origin = prepared.time_scale(name), prepared.time_origins[name]
         for step in steps[name]:

@@ -87,7 +87,7 @@ def outcome(before: Steps, after: Steps | None, put: Put) -> Outcome:
             mine = (
                 name == put.camera and abs(at - put.at) < _NEAR_S and abs(size - put.size) < _NEAR_SHARE * abs(put.size)
             )
-            known = any(abs(at - one[0]) < _NEAR_S and size * one[1] > 0.0 for one in before.get(name, ()))
+            known = any(abs(size - one[1]) < _NEAR_SHARE * abs(one[1]) for one in before.get(name, ()))
             if mine and not found:
                 found, z = True, (size - put.size) / std
             elif not known:
