@@ -6,8 +6,8 @@
 Simulated flights of `lasting_errors`; in each the clock of one camera steps by each size, in a random direction, after
 0.2 to 0.8 of its span; and once by nothing. --recorded: a session folder instead, each of its cameras with each size in
 both directions after 0.4 and 0.65 of its span. A step that is reported without one having been put in (of a recording
-it may be real) is no part of the figures. Found: reported of that camera, within 15 s (a drone that is parked does not tell), with its size to a half. Wrong:
-any other. z: error of the size over its stated std, of those found.
+it may be real) is no part of the figures. Found: reported of that camera, within 15 s (a parked drone does not tell),
+with its size to a half. Wrong: any other. z: error of the size over its stated std, of those found.
 """
 
 from __future__ import annotations
