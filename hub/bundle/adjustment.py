@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from hub.bundle.bordered_system import solve
-from hub.bundle.normal_equations import assemble, build_system, weigh_residuals
+from hub.bundle.normal_equations import assemble, weigh_residuals
 from hub.bundle.problem import (
     ASPECT,
     CAMERA_PARAMETERS,
@@ -31,7 +31,7 @@ from hub.bundle.problem import (
     Problem,
     TrackObservations,
 )
-from hub.bundle.residuals import LinearisedResiduals, linearise, predict, residual_norms
+from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry import so3
@@ -262,19 +262,3 @@ def _minimise(
             if damping > 1e6:
                 break
     return state
-
-
-__all__ = [
-    "LinearisedResiduals",
-    "SmoothnessPrior",
-    "adjust",
-    "apply_step",
-    "build_system",
-    "estimate_noise",
-    "estimate_smoothness",
-    "gauge_tangent",
-    "linearise",
-    "mark_inliers",
-    "predict",
-    "residual_norms",
-]

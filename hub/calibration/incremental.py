@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.bundle import model_comparison
-from hub.bundle.adjustment import residual_norms
 from hub.bundle.initialisation import (
     Reconstruction,
     place_cameras,
@@ -25,8 +24,9 @@ from hub.bundle.initialisation import (
 )
 from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
+from hub.bundle.residuals import residual_norms
 from hub.calibration.acceptance import least_certain_camera, misfits
-from hub.calibration.pair_network import expected_lag, solve_new_pairs
+from hub.calibration.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pair_overlap import LARGE_NETWORK
 from hub.calibration.pipeline import MAX_CLOCK_STEPS, STEP_PARAMETERS, bic_prefers, calibrate, final_adjustment
 from hub.calibration.resection_scan import scan_resection
@@ -138,7 +138,7 @@ def update_calibration(
         if full and unknown:
             prepared, pairs = solve_new_pairs(prepared, unknown, list(placed), clock_priors)
             clocks |= _clocks_from_pairs(pairs, placed, prepared)
-            reasons |= {name: _failed_with(name, pairs) for name in unknown if name not in clocks}
+            reasons |= {name: describe_failures(name, pairs) for name in unknown if name not in clocks}
     reasons = {name: reasons.get(name, "waits for the next search of its lag") for name in new if name not in clocks}
     if len(clocks) > len(placed) or moved:
         reconstruction, unplaced = place_cameras(
@@ -411,11 +411,6 @@ def _expected_clock(
         return None
     window, _, estimate = min(found, key=lambda one: one[:2])
     return estimate, window
-
-
-def _failed_with(name: str, pairs: list[PairSolution]) -> str:
-    tried = "; ".join(f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b))
-    return tried or "no other camera to compare with"
 
 
 def _tied_pairs(names: list[str], pairs: list[PairSolution]) -> tuple[PairSolution, ...]:

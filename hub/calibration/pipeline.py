@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from hub.bundle import model_comparison
-from hub.bundle.adjustment import adjust, estimate_noise, residual_norms
+from hub.bundle.adjustment import adjust, estimate_noise
 from hub.bundle.correlated_noise import refit_with_correlated_noise
 from hub.bundle.initialisation import (
     Reconstruction,
@@ -25,6 +25,7 @@ from hub.bundle.initialisation import (
 from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
 from hub.bundle.problem import AdjustmentState, CameraState, ClockStep, FreeParameters, Problem
+from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.acceptance import (
@@ -35,7 +36,14 @@ from hub.calibration.acceptance import (
     network_failure,
     wrong_lens,
 )
-from hub.calibration.pair_network import Progress, coincide, describe_timing, frame_rate_warnings, solve_pairs
+from hub.calibration.pair_network import (
+    Progress,
+    coincide,
+    describe_failures,
+    describe_timing,
+    frame_rate_warnings,
+    solve_pairs,
+)
 from hub.calibration.result import assemble_calibration, isolated_pair_report
 from hub.calibration.self_calibration import initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
@@ -458,7 +466,7 @@ def with_known_timing(prepared: PreparedSession, pairs: list[PairSolution]) -> d
         refused[name] = (
             f"no intrinsics: only its timing is known (pairs in result.json: {timing}); run `syncline intrinsics`"
             if timing
-            else f"{NO_INTRINSICS}; nor is its timing known ({_failed_pairs(name, pairs) or 'no other camera'})"
+            else f"{NO_INTRINSICS}; nor is its timing known ({describe_failures(name, pairs)})"
         )
     return refused
 
@@ -639,18 +647,12 @@ def _unplaced_reason(name: str, prepared: PreparedSession, pairs: list[PairSolut
         return (
             f"only its timing is known (pairs in result.json: {timing}): connected to no other camera with intrinsics"
         )
-    return _failed_pairs(name, pairs) or "no other camera to compare with"
-
-
-def _failed_pairs(name: str, pairs: list[PairSolution]) -> str:
-    return "; ".join(
-        f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b) and not p.solved
-    )
+    return describe_failures(name, pairs)
 
 
 def _disconnected_reason(name: str, groups: list[list[str]], pairs: list[PairSolution]) -> str:
     mine = next(group for group in groups if name in group)
-    tried = _failed_pairs(name, pairs)
+    tried = describe_failures(name, pairs)
     if len(mine) > 1:
         return f"connected only to {', '.join(other for other in mine if other != name)}, not to the rest ({tried})"
     return f"could not be connected to any camera ({tried})"
