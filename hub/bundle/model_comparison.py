@@ -372,7 +372,7 @@ class _Linearised:
         information = after @ cross[3] - (border * solved).sum(axis=0)
         information = np.maximum(information - (coupling * (self.covariance @ coupling)).sum(axis=0), 1e-9)
         k = int(np.argmax(score**2 / information))
-        change, rate = float(score[k] / information[k]), state.cameras[camera].rate
+        change, rate = float(score[k] / information[k]), float(state.cameras[camera].rate)
         cameras = -self.covariance @ (self.gradient - coupling[:, k] * change)
         path = -(self.path + self.parts.a_inv_b @ cameras - solved[:, k] * change)
         statistic = float(score[k] ** 2 / information[k])
