@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from hub.bundle.bordered_system import solve
-from hub.bundle.normal_equations import assemble, build_system, weigh_residuals
+from hub.bundle.normal_equations import assemble, weigh_residuals
 from hub.bundle.problem import (
     ASPECT,
     CAMERA_PARAMETERS,
@@ -31,7 +31,7 @@ from hub.bundle.problem import (
     Problem,
     TrackObservations,
 )
-from hub.bundle.residuals import LinearisedResiduals, linearise, predict, residual_norms
+from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry import so3
@@ -59,7 +59,7 @@ def adjust(
 ) -> tuple[Problem, AdjustmentState, SmoothnessPrior]:
     """Solve: robust rounds first, then the inliers with full weight.
 
-    coarse: stop early, for an initial estimate that is adjusted again.
+    coarse: leave out the last, fine round, for an initial estimate that is adjusted again.
     Returns the problem with inliers marked, the state, and the motion prior used.
     """
     prior = estimate_smoothness(problem, state, weak=True)
@@ -76,10 +76,10 @@ def adjust(
             robust = False
         if progress is not None:
             progress(f"adjustment {round_index + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
-    state = _minimise(
-        problem, state, prior, robust, iterations, _COARSE_TOLERANCE if coarse else _FINE_TOLERANCE, steps, coarse
-    )
-    return problem, replace(state, sigma=estimate_noise(problem, state), steps=tuple(steps)), prior
+    if not coarse:
+        state = _minimise(problem, state, prior, robust, iterations, _FINE_TOLERANCE, steps, coarse)
+        state = replace(state, sigma=estimate_noise(problem, state))
+    return problem, replace(state, steps=tuple(steps)), prior
 
 
 def estimate_noise(problem: Problem, state: AdjustmentState) -> Floats:
@@ -238,6 +238,7 @@ def _minimise(
     )
     pixels = float(np.sqrt(np.mean(state.sigma**2)))
     steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / residual_count))))
+    last_gain = 0.0
     for _ in range(iterations):
         system = system or assemble(problem, state, prior, current)
         try:
@@ -252,16 +253,12 @@ def _minimise(
             state, current, cost, system = trial, trial_residuals, trial_residuals.cost, None
             steps.append(AdjustmentStep(stage, pixels * float(np.sqrt(max(cost, 0.0) / residual_count))))
             damping = max(damping / 10.0, 1e-12)
-            if gain < tolerance * cost:
+            # Near the minimum each step gains the same share of the last one's gain: what the next would.
+            if gain * gain / max(gain, last_gain) < tolerance * cost:
                 break
+            last_gain = gain
         else:
             damping = max(damping * 10.0, 1e-8)
             if damping > 1e6:
                 break
     return state
-
-
-__all__ = [
-    "LinearisedResiduals", "SmoothnessPrior", "adjust", "apply_step", "build_system", "estimate_noise",
-    "estimate_smoothness", "gauge_tangent", "linearise", "mark_inliers", "predict", "residual_norms",
-]  # fmt: skip

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from hub.bundle.adjustment import adjust, mark_inliers, residual_norms
+from hub.bundle.adjustment import adjust, mark_inliers
 from hub.bundle.problem import (
     AdjustmentState,
     CameraState,
@@ -22,6 +22,7 @@ from hub.bundle.problem import (
     TrackObservations,
     Trajectory,
 )
+from hub.bundle.residuals import residual_norms
 from hub.clocks.clock_graph import ClockGraph
 from hub.sync.hypothesis import PairSolution, evidence
 from hub.trajectory.discrete import PointBasis, SampledTrack, merged_instants
@@ -40,9 +41,10 @@ _MAX_PNP_POINTS = 400  # evenly spread: bounds the time of RANSAC
 _PNP_THRESHOLD_PX = 8.0  # generous: the first trajectory is rough
 _MIN_PNP_POINTS = 12  # twice the six unknowns of a pose
 _MIN_FRAMES_PER_KNOT = 1.5  # below it a spline fits the noise
-_MAX_INITIAL_ROWS, _MIN_ROWS_PER_KNOT = 20_000, 2.0  # of more rows, early adjustments use a share
+_MAX_INITIAL_ROWS, _MIN_ROWS_PER_KNOT = 5_000, 2.0  # of more rows, early adjustments use a share
 _SMALL_NETWORK, _ADJUST_GROWTH = 6, 1.33  # cameras; growth
 _TRIANGULATION_STEP = 0.05  # s between triangulated points
+SEEN_WITHIN_S = 0.2  # a camera observes a point at a time if it has an observation this near
 _MAX_GAP = 1.0  # s: the trajectory is split where no camera saw the point for longer
 
 
@@ -327,7 +329,8 @@ def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: R
             continue
         time = clock.reference_time(track.time)
         where = path.at(time)
-        both = np.isfinite(where).all(axis=1) & seen_by_two(observation_times(reconstruction, number), time)
+        observed = observation_times(reconstruction.problem, reconstruction.state, number)
+        both = np.isfinite(where).all(axis=1) & seen_by_two(observed, time)
         positions.append(where[both])
         seen.append(track.points[both])
     if not positions:
@@ -335,23 +338,28 @@ def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: R
     return np.concatenate(positions), np.concatenate(seen)
 
 
-def observation_times(reconstruction: Reconstruction, number: int) -> list[Floats]:
-    """Sorted internal times at which a label is observed, by placed camera that observes it."""
+def observation_times(problem: Problem, state: AdjustmentState, label: int) -> list[Floats]:
+    """Sorted internal times at which a label is observed, by camera that observes it."""
     out = []
-    for camera, state in enumerate(reconstruction.state.cameras):
-        seen = [r.time[r.use] for r in reconstruction.problem.rows if r.camera == camera and r.label == number]
-        if seen and len(seen[0]):
-            out.append(np.sort(state.reference_time(np.concatenate(seen))))
+    for number, camera in enumerate(state.cameras):
+        seen = [rows.time[rows.use] for rows in problem.rows if rows.camera == number and rows.label == label]
+        if sum(map(len, seen)):
+            out.append(np.sort(camera.reference_time(np.concatenate(seen))))
     return out
 
 
-def seen_by_two(observed: list[Floats], time: Floats) -> Bools:
-    """Times (n,) within 0.2 s of observations of at least two placed cameras. observed: of `observation_times`."""
+def seen_by_two(
+    observed: list[Floats], time: Floats, within: float = SEEN_WITHIN_S, beyond: float = SEEN_WITHIN_S
+) -> Bools:
+    """Times (n,) within ``within`` [s] of observations of at least two cameras. observed: of `observation_times`.
+
+    beyond: how long [s] before its first and after its last observation a camera counts at most.
+    """
     count = np.zeros(len(time), dtype=np.int64)
     for reference in observed:
         after = np.clip(np.searchsorted(reference, time), 1, len(reference) - 1)
         nearest = np.minimum(np.abs(reference[after] - time), np.abs(reference[after - 1] - time))
-        count += nearest < 0.2
+        count += (nearest <= within) & (time >= reference[0] - beyond) & (time <= reference[-1] + beyond)
     return count >= 2
 
 

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.bundle import model_comparison
-from hub.bundle.adjustment import residual_norms
 from hub.bundle.initialisation import (
     Reconstruction,
     place_cameras,
@@ -25,10 +24,11 @@ from hub.bundle.initialisation import (
 )
 from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
+from hub.bundle.residuals import residual_norms
 from hub.calibration.acceptance import least_certain_camera, misfits
-from hub.calibration.pair_network import expected_lag, solve_new_pairs
+from hub.calibration.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pair_overlap import LARGE_NETWORK
-from hub.calibration.pipeline import MAX_CLOCK_STEPS, bic_prefers, calibrate, final_adjustment
+from hub.calibration.pipeline import MAX_CLOCK_STEPS, STEP_PARAMETERS, bic_prefers, calibrate, final_adjustment
 from hub.calibration.resection_scan import scan_resection
 from hub.calibration.result import assemble_calibration
 from hub.calibration.self_calibration import focal_prior, with_cameras, with_lens
@@ -138,7 +138,7 @@ def update_calibration(
         if full and unknown:
             prepared, pairs = solve_new_pairs(prepared, unknown, list(placed), clock_priors)
             clocks |= _clocks_from_pairs(pairs, placed, prepared)
-            reasons |= {name: _failed_with(name, pairs) for name in unknown if name not in clocks}
+            reasons |= {name: describe_failures(name, pairs) for name in unknown if name not in clocks}
     reasons = {name: reasons.get(name, "waits for the next search of its lag") for name in new if name not in clocks}
     if len(clocks) > len(placed) or moved:
         reconstruction, unplaced = place_cameras(
@@ -210,8 +210,7 @@ def _clock_step(
     First one that is not known; then what is left of a known one, where that is more than its std.
     """
     problem, state = reconstruction.problem, reconstruction.state
-    tested = model_comparison.with_rows_of_a_step(problem, state)
-    found, new = model_comparison.find_clock_step(tested, state, against_lenses=True), 1
+    found, new = model_comparison.find_clock_step(problem, state), STEP_PARAMETERS
     for name in () if found is not None else [name for name in reconstruction.names if name in steps]:
         scale, origin = prepared.time_scale(name), prepared.time_origins[name]
         for step in steps[name]:
@@ -412,11 +411,6 @@ def _expected_clock(
         return None
     window, _, estimate = min(found, key=lambda one: one[:2])
     return estimate, window
-
-
-def _failed_with(name: str, pairs: list[PairSolution]) -> str:
-    tried = "; ".join(f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b))
-    return tried or "no other camera to compare with"
 
 
 def _tied_pairs(names: list[str], pairs: list[PairSolution]) -> tuple[PairSolution, ...]:

@@ -476,6 +476,12 @@ def describe_timing(name: str, prepared: PreparedSession, pairs: list[PairSoluti
     return ", ".join(parts)
 
 
+def describe_failures(name: str, pairs: list[PairSolution]) -> str:
+    """Why a camera's pairs are not solved."""
+    tried = (f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b) and not p.solved)
+    return "; ".join(tried) or "no other camera to compare with"
+
+
 def pair_lag(prepared: PreparedSession, pair: PairSolution, fit: PairFit) -> float:
     """``t_a - t_b`` [s] on the cameras' own clocks, in the middle of the common recording time."""
     begin_a, end_a = _time_span(prepared, pair.a)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from hub.bundle import model_comparison
-from hub.bundle.adjustment import adjust, estimate_noise, residual_norms
+from hub.bundle.adjustment import adjust, estimate_noise
 from hub.bundle.correlated_noise import refit_with_correlated_noise
 from hub.bundle.initialisation import (
     Reconstruction,
@@ -24,7 +24,8 @@ from hub.bundle.initialisation import (
 )
 from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
-from hub.bundle.problem import AdjustmentState, CameraState, FreeParameters, Problem
+from hub.bundle.problem import AdjustmentState, CameraState, ClockStep, FreeParameters, Problem
+from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.acceptance import (
@@ -35,7 +36,14 @@ from hub.calibration.acceptance import (
     network_failure,
     wrong_lens,
 )
-from hub.calibration.pair_network import Progress, coincide, describe_timing, frame_rate_warnings, solve_pairs
+from hub.calibration.pair_network import (
+    Progress,
+    coincide,
+    describe_failures,
+    describe_timing,
+    frame_rate_warnings,
+    solve_pairs,
+)
 from hub.calibration.result import assemble_calibration, isolated_pair_report
 from hub.calibration.self_calibration import initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
@@ -58,6 +66,7 @@ if TYPE_CHECKING:
 _LENS_ITERATIONS = 3  # a bound: it stops where no lens changes
 _SMALL_BODY = 4  # points of a single tag
 MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2  # steps of all clocks in one recording; Gauss-Newton steps for each
+STEP_PARAMETERS, _STEP_TOLERANCE = 2, 0.5  # time and size; what is left of a size, in stds
 _ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
 _MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 
@@ -457,7 +466,7 @@ def with_known_timing(prepared: PreparedSession, pairs: list[PairSolution]) -> d
         refused[name] = (
             f"no intrinsics: only its timing is known (pairs in result.json: {timing}); run `syncline intrinsics`"
             if timing
-            else f"{NO_INTRINSICS}; nor is its timing known ({_failed_pairs(name, pairs) or 'no other camera'})"
+            else f"{NO_INTRINSICS}; nor is its timing known ({describe_failures(name, pairs)})"
         )
     return refused
 
@@ -467,30 +476,38 @@ def in_rig_order(refused: dict[str, str], prepared: PreparedSession) -> dict[str
     return {name: refused[name] for name in prepared.camera_order if name in refused}
 
 
-def _with_clock_steps(
-    problem: Problem, state: AdjustmentState, against_lenses: bool
-) -> tuple[Problem, AdjustmentState]:
+def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
     """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
-    step = model_comparison.find_clock_step(problem, state, against_lenses)
     for _ in range(MAX_CLOCK_STEPS):
+        step = model_comparison.find_clock_step(problem, state)
         if step is None:
             break
-        middle, trial_state = state.cameras[step.camera].centre, state
-        for left in range(_STEP_ITERATIONS, -1, -1):
-            trial, trial_state, _ = adjust(
-                model_comparison.with_clock_step(problem, step, middle), trial_state, rounds=2
-            )
-            rest = model_comparison.remaining_step(trial, trial_state, step.camera, step.time)
-            step = replace(step, std=rest.std)
-            if abs(rest.size) < rest.std or not left:
-                break
-            # The size is of one Gauss-Newton step, which leaves a part of a large one.
-            step = replace(step, size=step.size + rest.size)
-        if not bic_prefers(trial, trial_state, problem, state):
+        trial, found = _with_sizes(problem, state, step)
+        if not bic_prefers(trial, found, problem, state, STEP_PARAMETERS):
             break
-        problem, state = trial, replace(trial_state, clock_steps=(*trial_state.clock_steps, step))
-        step = model_comparison.find_clock_step(problem, state, against_lenses)
+        problem, state = trial, found
     return problem, state
+
+
+def _with_sizes(problem: Problem, state: AdjustmentState, new: ClockStep) -> tuple[Problem, AdjustmentState]:
+    """Problem and state adjusted with a further clock step corrected, all sizes iterated.
+
+    A size is first of one Gauss-Newton step, which leaves a part of a large one, and of a model without this step.
+    """
+    steps, corrected = [*state.clock_steps, new], [*(one.size for one in state.clock_steps), 0.0]
+    found, trial = problem, state
+    for left in range(_STEP_ITERATIONS, -1, -1):
+        found = problem
+        for one, done in zip(steps, corrected, strict=True):
+            change = replace(one, size=one.size - done)
+            found = model_comparison.with_clock_step(found, change, state.cameras[one.camera].centre)
+        found, trial, _ = adjust(found, trial, rounds=2)
+        rest = [model_comparison.remaining_step(found, trial, one.camera, one.time) for one in steps]
+        steps = [replace(one, std=more.std) for one, more in zip(steps, rest, strict=True)]
+        if all(abs(more.size) < _STEP_TOLERANCE * more.std for more in rest) or not left:
+            break
+        steps = [replace(one, size=one.size + more.size) for one, more in zip(steps, rest, strict=True)]
+    return found, replace(trial, clock_steps=tuple(steps))
 
 
 def final_adjustment(
@@ -523,14 +540,14 @@ def final_adjustment(
             return reconstruction  # the camera will be left out
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     if not (warm and online):
-        problem, state = _with_clock_steps(problem, state, against_lenses=online)
+        problem, state = _with_clock_steps(problem, state)
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
     problem = model_comparison.with_crystal_rates(problem, state)
     if refine_lenses and not warm:
         report("adjusting the lenses", 0.85)
         freed = replace(problem, free_parameters=replace(problem.free_parameters, lens=True))
         freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: report(text, 0.85))
-        if bic_prefers(freed_problem, freed_state, problem, state):
+        if bic_prefers(freed_problem, freed_state, problem, state, 2 * len(state.cameras)):
             problem, state = freed_problem, freed_state
     if (
         not online
@@ -545,7 +562,7 @@ def final_adjustment(
             held = model_comparison.without_negative_readouts(read_problem, read_state)
             read_problem, read_state, _ = adjust(*held, rounds=2)
         if model_comparison.are_readouts_plausible(read_problem, read_state) and bic_prefers(
-            read_problem, read_state, problem, state, 1
+            read_problem, read_state, problem, state, len(state.cameras)
         ):
             problem, state = read_problem, read_state
     adjusted = _with_state(reconstruction, problem, state)
@@ -582,16 +599,16 @@ def _with_state(reconstruction: Reconstruction, problem: Problem, state: Adjustm
 
 
 def bic_prefers(
-    freed: Problem, freed_state: AdjustmentState, fixed: Problem, fixed_state: AdjustmentState, parameters: int = 2
+    freed: Problem, freed_state: AdjustmentState, fixed: Problem, fixed_state: AdjustmentState, parameters: int
 ) -> bool:
-    """Whether ``parameters`` more per camera (focal length and k1) are justified (Bayesian information criterion).
+    """Whether ``parameters`` more are justified (Bayesian information criterion).
 
     It uses the robust likelihood of all rows under each solution's own noise, at the effective sample size.
     """
     inflation = correlation_inflation(freed, freed_state)
     rows = sum(len(part.time) / inflation[part.camera] for part in fixed.rows)
     gain = float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / inflation).sum())
-    return bool(gain > parameters * len(fixed_state.cameras) * np.log(max(rows, 2)))
+    return bool(gain > parameters * np.log(max(rows, 2)))
 
 
 def _deviances(problem: Problem, state: AdjustmentState) -> Floats:
@@ -630,18 +647,12 @@ def _unplaced_reason(name: str, prepared: PreparedSession, pairs: list[PairSolut
         return (
             f"only its timing is known (pairs in result.json: {timing}): connected to no other camera with intrinsics"
         )
-    return _failed_pairs(name, pairs) or "no other camera to compare with"
-
-
-def _failed_pairs(name: str, pairs: list[PairSolution]) -> str:
-    return "; ".join(
-        f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b) and not p.solved
-    )
+    return describe_failures(name, pairs)
 
 
 def _disconnected_reason(name: str, groups: list[list[str]], pairs: list[PairSolution]) -> str:
     mine = next(group for group in groups if name in group)
-    tried = _failed_pairs(name, pairs)
+    tried = describe_failures(name, pairs)
     if len(mine) > 1:
         return f"connected only to {', '.join(other for other in mine if other != name)}, not to the rest ({tried})"
     return f"could not be connected to any camera ({tried})"

@@ -167,7 +167,7 @@ def find_time_map(
     tracks = {label: track for label, track in camera.tracks.items() if isinstance(track, SmoothTrack)}
     paths = reconstruction.state.trajectories
     labels = [
-        _SeenLabel(tracks[label], paths[i], observation_times(reconstruction, i))
+        _SeenLabel(tracks[label], paths[i], observation_times(reconstruction.problem, reconstruction.state, i))
         for i, label in enumerate(reconstruction.labels)
         if label in tracks
     ]

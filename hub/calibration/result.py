@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 
 from hub.bundle import covariance as cov
-from hub.bundle.adjustment import predict, residual_norms
 from hub.bundle.datum.control_outliers import reject_outliers, reject_refuted
 from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
 from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state, with_exact_poses
 from hub.bundle.datum.held_gauge import similarity_to_published
-from hub.bundle.initialisation import Reconstruction
+from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation_times, seen_by_two
 from hub.bundle.model_comparison import REFUTED_SIGMA
 from hub.bundle.noise_scale import rescale_noise
 from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
+from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
 from hub.calibration.pair_network import RATE_TOLERANCE, pair_lag
@@ -33,8 +33,6 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
 from protocols.session.rig import Rig
 
-SEEN_WITHIN = 0.2
-"""A camera counts as observing at a time if it has an observation within this interval [s]."""
 _SHORT_GAPS, _MAX_NOMINAL = 0.05, 4.0
 """Quantile of a camera's gaps between rows that stands for consecutive frames, and how much faster than those its
 nominal rate may be: a target seen in every fourth frame at best."""
@@ -145,19 +143,8 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         refused=solution.refused,
         acceptance=solution.acceptance,
         convergence=reconstruction.state.steps,
-        trajectories=tuple(
-            _trajectory_table(
-                problem,
-                state,
-                covariance,
-                label,
-                name,
-                reference,
-                time_origins[reference],
-                time_scales[reference],
-                _sampling_rate(rig, problem, names, time_scales, time_scales[reference]),
-            )
-            for label, name in enumerate(reconstruction.labels)
+        trajectories=_tables(
+            rig, solution.prepared, names, reconstruction.labels, problem, state, covariance, reference
         ),
         pairs=tuple(_pair_report(pair, cameras, problem, state, names, solution) for pair in solution.pairs),
         warnings=solution.prepared.warnings
@@ -185,14 +172,7 @@ def trajectory_tables(
     problem, state, names = reconstruction.problem, reconstruction.state, reconstruction.names
     prior = estimate_smoothness(problem, state)
     covariance = cov.covariance(problem, rescale_noise(problem, state, prior), prior)
-    reference = names.index(base)
-    time_scales = [prepared.time_scale(name) for name in names]
-    rate_hz = _sampling_rate(rig, problem, names, time_scales, time_scales[reference])
-    time_origin, time_scale = prepared.time_origins[base], time_scales[reference]
-    return tuple(
-        _trajectory_table(problem, state, covariance, label, name, reference, time_origin, time_scale, rate_hz)
-        for label, name in enumerate(reconstruction.labels)
-    )
+    return _tables(rig, prepared, names, reconstruction.labels, problem, state, covariance, names.index(base))
 
 
 def _internal_time(
@@ -409,57 +389,38 @@ def _sampling_rate(rig: Rig, problem: Problem, names: list[str], time_scales: li
     return max([rate for rate in rates if np.isfinite(rate)], default=30.0) or 30.0
 
 
-def observing_cameras(problem: Problem, state: AdjustmentState, label: int, time: Floats) -> Floats:
-    """Number of cameras that observed the point within SEEN_WITHIN of internal reference times (n,), both before and
-    after them or at them."""
-    # With a shared clock a point is observed at its own instant or not at all.
-    within = INSTANT_TOLERANCE_S if isinstance(state.trajectories[label].basis, PointBasis) else SEEN_WITHIN
-    count = np.zeros(len(time))
-    for number, camera in enumerate(state.cameras):
-        observed = [r.time[r.use] for r in problem.rows if r.camera == number and r.label == label]
-        joined = np.concatenate(observed) if observed else np.zeros(0)
-        if len(joined) < 2:
-            continue
-        observation_times = np.sort(camera.reference_time(joined))
-        after = np.clip(np.searchsorted(observation_times, time), 1, len(observation_times) - 1)
-        near = (
-            np.minimum(np.abs(observation_times[after] - time), np.abs(time - observation_times[after - 1])) <= within
-        )
-        # Before its first and after its last observation of the point a camera has seen nothing of it.
-        span = (time >= observation_times[0] - INSTANT_TOLERANCE_S) & (
-            time <= observation_times[-1] + INSTANT_TOLERANCE_S
-        )
-        count += near & span
-    return count
-
-
-def _trajectory_table(
+def _tables(
+    rig: Rig,
+    prepared: PreparedSession,
+    names: list[str],
+    labels: list[str],
     problem: Problem,
     state: AdjustmentState,
     covariance: cov.Covariance,
-    label: int,
-    name: str,
     reference: int,
-    time_origin: float,
-    time_scale: float,
-    rate_hz: float,
-) -> TrajectoryTable:
-    """Trajectory of one label at ``rate_hz`` on the reference camera's clock, where at least two cameras saw it."""
-    base = state.cameras[reference]
-    path = state.trajectories[label]
-    if isinstance(path.basis, PointBasis):
-        ticks = base.camera_time(path.basis.instants) / time_scale + time_origin
-    else:
-        # A grid on the reference camera's clock, so that two runs on one log sample the same instants.
-        first, last = base.camera_time(np.array([path.basis.begin, path.basis.end])) / time_scale
-        rate_hz = min(rate_hz, _MAX_SAMPLES / max(last - first, 1.0 / rate_hz))
-        ticks = (
-            np.arange(np.ceil((first + time_origin) * rate_hz), np.floor((last + time_origin) * rate_hz) + 1) / rate_hz
-        )
-    internal = base.reference_time((ticks - time_origin) * time_scale)
-    position = path.at(internal)
-    good = np.isfinite(position).all(axis=1) & (observing_cameras(problem, state, label, internal) >= 2)
-    return TrajectoryTable(name, ticks[good], position[good], cov.path_std(covariance, state, label, internal[good]))
+) -> tuple[TrajectoryTable, ...]:
+    """Trajectories at the frame rate of the fastest camera, on a reference camera's clock, where two cameras saw it."""
+    base, time_origin = state.cameras[reference], prepared.time_origins[names[reference]]
+    time_scales = [prepared.time_scale(name) for name in names]
+    time_scale, out = time_scales[reference], []
+    rate_hz = _sampling_rate(rig, problem, names, time_scales, time_scale)
+    for label, path in enumerate(state.trajectories):
+        within = SEEN_WITHIN_S
+        if isinstance(path.basis, PointBasis):
+            within = INSTANT_TOLERANCE_S  # a point is observed at its own instant or not at all
+            ticks = base.camera_time(path.basis.instants) / time_scale + time_origin
+        else:
+            # A grid on the reference camera's clock, so that two runs on one log sample the same instants.
+            first, last = base.camera_time(np.array([path.basis.begin, path.basis.end])) / time_scale
+            rate = min(rate_hz, _MAX_SAMPLES / max(last - first, 1.0 / rate_hz))
+            ticks = np.arange(np.ceil((first + time_origin) * rate), np.floor((last + time_origin) * rate) + 1) / rate
+        internal = base.reference_time((ticks - time_origin) * time_scale)
+        position = path.at(internal)
+        seen = seen_by_two(observation_times(problem, state, label), internal, within, INSTANT_TOLERANCE_S)
+        good = np.isfinite(position).all(axis=1) & seen
+        std = cov.path_std(covariance, state, label, internal[good])
+        out.append(TrajectoryTable(labels[label], ticks[good], position[good], std))
+    return tuple(out)
 
 
 def _pair_report(

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.bundle.datum.gauge import Gauge
+from hub.bundle.initialisation import observation_times, seen_by_two
 from hub.bundle.problem import AdjustmentState, Problem
 from protocols.core.errors import Refused
 from protocols.geometry.pose import Similarity
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Floats
 from protocols.session.rig import Rig
 
-_SEEN_WITHIN = 0.2  # s: a camera observes a point at a time if it has an observation this near
 _SAMPLING_STEP = 0.05  # s between samples
 _MIN_SAMPLES = 10  # of a bar's length
 _MAX_LENGTH_SPREAD = 0.2  # relative robust spread of the length; more means that it is not rigid
@@ -88,22 +88,6 @@ def _distances(problem: Problem, state: AdjustmentState, a: int, b: int) -> Floa
     time = np.arange(begin, end, _SAMPLING_STEP)
     if not len(time):
         return np.zeros(0)
-    good = _seen_by_two(problem, state, a, time) & _seen_by_two(problem, state, b, time)
+    seen_a, seen_b = (seen_by_two(observation_times(problem, state, label), time) for label in (a, b))
     distance = np.linalg.norm(paths[0].at(time) - paths[1].at(time), axis=1)
-    return np.asarray(distance[good & np.isfinite(distance)])
-
-
-def _seen_by_two(problem: Problem, state: AdjustmentState, label: int, time: Floats) -> Bools:
-    count = np.zeros(len(time))
-    for number, camera in enumerate(state.cameras):
-        observed = [rows.time[rows.use] for rows in problem.rows if rows.camera == number and rows.label == label]
-        times = np.concatenate(observed) if observed else np.zeros(0)
-        if len(times) < 2:
-            continue
-        observation_times = np.sort(camera.reference_time(times))
-        after = np.clip(np.searchsorted(observation_times, time), 1, len(observation_times) - 1)
-        count += (
-            np.minimum(np.abs(observation_times[after] - time), np.abs(time - observation_times[after - 1]))
-            <= _SEEN_WITHIN
-        )
-    return count >= 2
+    return np.asarray(distance[seen_a & seen_b & np.isfinite(distance)])

@@ -123,7 +123,7 @@ def absolute_tests(fit: PairFit, s: PairSettings) -> tuple[AcceptanceTest, ...]:
         acceptance_test(
             "plane's residual over the residual",
             # Where no plane was fitted (few points), none explains the motion.
-            np.nan_to_num(fit.planar_residual_px, nan=np.inf) / max(fit.residual_px, s.sigma_px),
+            np.nan_to_num(fit.planar_residual_px, nan=np.inf) / np.nan_to_num(max(fit.residual_px, s.sigma_px)),
             s.min_planar_ratio,
             "the motion lies in one plane (or the cameras stand in one place), which leaves the geometry undetermined",
         ),

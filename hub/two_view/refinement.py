@@ -20,6 +20,8 @@ SEARCH_WIDTH = 2.0
 """Final width [sigma] of the Cauchy weight in a search."""
 FINAL_WIDTH = 4.0
 """Final width [sigma] of the Cauchy weight in a final fit: 0.996 of the efficiency of least squares."""
+_TOLERANCE = 1e-4
+"""Relative decrease of the cost at which it has converged."""
 _MIN_ROWS = 12  # twice the six unknowns of a relative pose and a lag
 
 
@@ -91,7 +93,7 @@ def refine(
     rows = _linearise(sampler, geometry, inverse_rate, intercept, noise, fixed_geometry)
     if rows is None:
         return None
-    system = _normal_equations(rows, inverse_rate, width, noise)
+    system, last_gain = _normal_equations(rows, inverse_rate, width, noise), 0.0
     for _ in range(iterations):
         normal, gradient, cost = system
         damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
@@ -104,9 +106,11 @@ def refine(
             geometry, (inverse_rate, intercept), rows = trial_geometry, trial_map, trial_rows
             damping = max(damping / 5.0, 1e-9)
             if width == final_width:
-                system = trial
-                if cost - trial[2] < 1e-4 * cost:
+                system, gain = trial, cost - trial[2]
+                # Near the minimum each step gains the same share of the last one's gain: what the next would.
+                if gain * gain / max(gain, last_gain) < _TOLERANCE * cost:
                     break
+                last_gain = gain
                 continue
         elif width == final_width:
             damping *= 8.0

@@ -27,7 +27,7 @@ _MIN_ROWS = 30
 _MARGIN = 2.0  # of the truth before the first row and after the last [s], as the time map still changes
 _OUTLIER_SIGMA = 5.0  # robust stds
 _MEDIAN_NORM = 1.1774  # of two unit normals
-_ROUNDS, _STEPS = 20, 8
+_ROUNDS, _STEPS = 40, 8
 _CONVERGED = 0.1  # parameter change of a converged round [stds]
 # rotation [rad] and translation [truth's unit] of the world, time [s], rate [1e-3], focal length [%]
 _DIFFERENCES = np.array([1e-6] * 3 + [1e-4] * 3 + [1e-4, 1e-3, 1e-3])

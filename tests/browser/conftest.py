@@ -49,7 +49,7 @@ class Tab:
     def __init__(self, browser: Any, size: tuple[int, int] = (1100, 700)) -> None:
         self.context = browser.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
         self.page = self.context.new_page()
-        self.page.set_default_timeout(120_000)
+        self.page.set_default_timeout(300_000)
         self.errors: list[str] = []
         self.requests: list[str] = []
         self.page.on("console", self._heard)

@@ -21,19 +21,14 @@ from scipy.optimize import least_squares
 from scipy.sparse import coo_array, csr_array
 
 from deploy.agents.malloc_tuning import retain_freed_memory
-from hub.bundle.adjustment import (
-    LinearisedResiduals,
-    SmoothnessPrior,
-    _minimise,
-    apply_step,
-    build_system,
-    estimate_smoothness,
-    linearise,
-)
+from hub.bundle.adjustment import _minimise, apply_step
 from hub.bundle.bordered_system import THIRD_DIFFERENCE, third_differences
 from hub.bundle.initialisation import _camera_state, triangulate_and_adjust
+from hub.bundle.normal_equations import build_system
 from hub.bundle.preprocessing import prepare
 from hub.bundle.problem import CAMERA_PARAMETERS, GIVEN_PARAMETERS, RATE, AdjustmentState, FreeParameters, Problem
+from hub.bundle.residuals import LinearisedResiduals, linearise
+from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.calibration import pipeline
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from protocols.geometry import so3

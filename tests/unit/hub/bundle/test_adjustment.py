@@ -8,16 +8,10 @@ import numpy as np
 import pytest
 
 from hub.bundle import bordered_system
-from hub.bundle.adjustment import (
-    adjust,
-    apply_step,
-    build_system,
-    gauge_tangent,
-    linearise,
-    residual_norms,
-)
+from hub.bundle.adjustment import adjust, apply_step, gauge_tangent
 from hub.bundle.bordered_system import BAND, BorderedSystem, eliminate, solve
 from hub.bundle.covariance import _inverse_blocks
+from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
     ASPECT,
     CAMERA_PARAMETERS,
@@ -37,6 +31,7 @@ from hub.bundle.problem import (
     TrackObservations,
     Trajectory,
 )
+from hub.bundle.residuals import linearise, residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior
 from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from hub.bundle import correlated_noise
-from hub.bundle.adjustment import adjust, apply_step, residual_norms
+from hub.bundle.adjustment import adjust, apply_step
 from hub.bundle.correlated_noise import lens_tolerance, prefers_nominal_lenses, refit_with_correlated_noise
 from hub.bundle.covariance import covariance
 from hub.bundle.gauss_markov import GaussMarkov, estimate_correlated_noise, fit_maximum_likelihood
@@ -25,6 +25,7 @@ from hub.bundle.problem import (
     TrackObservations,
     Trajectory,
 )
+from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.calibration.result import focal_stds
 from hub.trajectory.splines import SplineBasis, fit_spline

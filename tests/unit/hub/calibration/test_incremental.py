@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.bundle import model_comparison
 from hub.calibration.incremental import update_calibration
 from hub.calibration.pipeline import calibrate
 from hub.clocks.arrival_prior import ERROR_BOUND_S, ArrivalPriors
@@ -226,16 +225,3 @@ def test_the_first_answer_of_a_window_with_a_clock_step_holds_after_it() -> None
     shown = CameraTime(session.shown("cam2", 40.0) + 0.03)
     error = float(found.cameras["cam2"].time_map.reference_from_camera(shown)) - session.shown(found.reference, 40.0)
     assert abs(error) < 2.0 * found.cameras["cam2"].time_offset_std < 4e-3
-
-
-def test_a_step_that_a_wrong_lens_explains_better_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a real rig whose focal lengths are 2 % off, slow errors of a part of the flight look like steps of 30 ms."""
-    session = simulate(1, 4, 40)
-    mine = np.array([name == "cam2" for name in session.camera])
-    at = float(np.quantile(session.time[mine], 0.8))
-    stepped = replace(session, time=session.time + np.where(mine & (session.time >= at), 0.03, 0.0))
-    first = update_calibration(session.rig, until(session, 30.0), None).calibration
-    better = model_comparison.LensTest(1, 0.02, 0.003, 1e9, 20.0)
-    monkeypatch.setattr(model_comparison, "refuted_lenses", lambda *of: [better])
-    found = update_calibration(session.rig, stepped.observations(), first, full=False, search=False).calibration
-    assert not any(camera.clock_steps for camera in found.cameras.values())

@@ -17,7 +17,6 @@ from hub.sync.hypothesis import PairFit, PairSolution, swap_cameras
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import SmoothTrack, smooth_only
 from hub.two_view.relative_pose import FundamentalMatrix, RelativePose
-from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.session.observations import Observations
 from tests.bench.drone_pairs import Stretch, stretch
@@ -180,11 +179,11 @@ def test_an_unobservable_rate_keeps_its_prior_in_a_two_camera_adjustment(monkeyp
         return out
 
     seeds = (7021, 7046)
-    assert max(rates(seeds)) < 400.0
+    held = max(rates(seeds))
+    assert held < 400.0
     free: Callable[..., float] = lambda graph, usual: usual  # noqa: E731
     monkeypatch.setattr(solver, "_rate_prior_std", free)
-    with pytest.raises(Refused, match="the trajectory puts its clock"):
-        rates(seeds)
+    assert max(rates(seeds)) > held + 30.0
 
 
 def test_the_rate_prior_of_a_pair_is_not_used_as_an_observation() -> None:
