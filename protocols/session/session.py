@@ -12,7 +12,7 @@ import tomli_w
 
 from protocols.core.errors import InputError
 from protocols.core.tables import dataframe
-from protocols.session.folder import out_of_image_warnings, write_observations
+from protocols.session.folder import out_of_image_warnings
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
 from protocols.session.rig import Rig, parse_rig
 
@@ -91,10 +91,6 @@ class Session:
                 "size": _joined([track.size for track in tracks]),
             }
         )
-
-    def save_observations(self, file: str | Path) -> None:
-        """Write observations.csv. Raises InputError."""
-        write_observations(Path(file), self.observations)
 
 
 def _numbers(values: Any, name: str) -> Any:
