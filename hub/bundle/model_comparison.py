@@ -237,8 +237,7 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
         return None
     # A camera that steps has the most correlated residuals of all, for that reason: here it must not count for less.
     linear, trials = _Linearised.of(problem, state, state.sigma * np.sqrt(np.median(inflation))), []
-    rows = sum(int(part.use.sum()) for part in problem.rows)
-    needed = 2.0 * np.log(max(rows, 2)) + 2.0 * np.log(_STEP_TIMES * len(state.cameras))
+    needed = needed_for_a_step(problem)
     for camera in range(len(state.cameras)):
         used = [part.time[part.use] for part in problem.rows if part.camera == camera]
         times = np.unique(np.concatenate([np.zeros(0), *used]))
@@ -255,6 +254,13 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     ]
     best = max(found, key=lambda one: one.statistic, default=None)
     return None if best is None or best.statistic <= needed or abs(best.size) <= _MIN_STEP_S else best
+
+
+def needed_for_a_step(problem: Problem) -> float:
+    """The chi-squared that a clock step needs: by the Bayesian information criterion of its size, and by how many are
+    tried."""
+    rows = sum(int(part.use.sum()) for part in problem.rows)
+    return float(2.0 * np.log(max(rows, 2)) + 2.0 * np.log(_STEP_TIMES * len(problem.nominal)))
 
 
 def remaining_step(problem: Problem, state: AdjustmentState, camera: int, time: float) -> ClockStep:
