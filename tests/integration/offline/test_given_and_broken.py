@@ -34,6 +34,7 @@ from tests.bench.simulated_rigs import make_rallies
 from tests.support import rigs
 
 DRONE2 = Path(__file__).parents[4] / "shared" / "data" / "drone2"
+DRONE1 = DRONE2.with_name("drone1")
 
 
 def of(session: rigs.Session, name: str) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
@@ -240,6 +241,16 @@ def test_a_clock_step_is_reported_of_its_camera_five_seconds_later(
     ((at, size, std),) = steps[put.camera]
     assert at == pytest.approx(put.at, abs=1.0)
     assert abs(size - put.size) < 3.0 * std < 0.015
+
+
+@pytest.mark.skipif(not DRONE1.is_dir(), reason="no recording in ../shared/data")
+def test_a_step_that_is_little_once_its_size_is_estimated_is_not_reported() -> None:
+    """cam1 steps by 60 ms, which its rate takes up; in the linear model cam0 then seems to step."""
+    rig, observations = read_folder(DRONE1)
+    (track,) = observations.of_camera("cam1")
+    put = Put("cam1", float(track.time[0] + 0.4 * np.ptp(track.time)), 0.06)
+    found = calibrate(rig, stepped(observations, put))
+    assert not any(camera.clock_steps for name, camera in found.cameras.items() if name != put.camera)
 
 
 def test_a_readout_is_neither_negative_nor_longer_than_a_frame(four: tuple[rigs.Session, Calibration]) -> None:
