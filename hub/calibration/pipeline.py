@@ -484,8 +484,7 @@ def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem
             break
         trial, found = _with_sizes(problem, state, step)
         # What was a step of a linear model, in noise that it explained, may be little once it is estimated.
-        needed = model_comparison.needed_for_a_step(problem)
-        if any((one.size / one.std) ** 2 < needed for one in found.clock_steps):
+        if any((one.size / one.std) ** 2 < model_comparison.needed_for_a_step(problem) for one in found.clock_steps):
             break
         problem, state = trial, found
     return problem, state
