@@ -613,7 +613,8 @@ def test_agents_are_configured_and_installed_by_the_names_of_users(name: str, tm
     assert run(["hub", str(file), "--print-config"]) == 0
     assert f'nodes = ["{name}"]' in capsys.readouterr().out.replace("\n", "").replace("    ", "").replace(",]", "]")
     file.write_text(f'id = "{name}"\nsite = "yard"\n', encoding="utf-8")
-    assert run(["install", "camera", "--config", str(file), "--root", str(tmp_path), "--dry-run"]) == 0
+    program = ["--program", "/opt/syncline/bin/syncline"]
+    assert run(["install", "camera", "--config", str(file), "--root", str(tmp_path), "--dry-run", *program]) == 0
     service = f"camera-{key_segment(name).replace('%', '.')}"
     assert f"/etc/systemd/system/syncline-{service}.service" in capsys.readouterr().out
 
