@@ -181,20 +181,22 @@ class SceneRenderer:
         found = camera.calibration
         assert found is not None
         name, scale = camera.name, 0.07 * self._size
-        place = (tuple(pose.position), tuple(so3.quaternion(pose.rotation.T)), status, round(scale, 3))
+        wxyz, position = so3.quaternion(pose.rotation.T), pose.position
+        place = (tuple(position), tuple(wxyz), status, round(scale, 3))
         if self._drawn.get(f"camera {name}") != place:
             self._drawn[f"camera {name}"] = place
             frustum = self._frusta.get(name)
             if frustum is None:
                 fov, aspect = _field_of_view(camera)
                 frustum = self._scene.add_camera_frustum(
-                    f"/cameras/{name}", fov=fov, aspect=aspect, scale=scale, thickness=2.0, thickness_units="screen"
-                )
+                    f"/cameras/{name}", fov=fov, aspect=aspect, scale=scale, thickness=2.0, thickness_units="screen",
+                    wxyz=wxyz, position=position,
+                )  # fmt: skip
                 self._frusta[name] = frustum
                 self._labels[name] = self._scene.add_label(f"/labels/{name}", "", anchor="bottom-center")
-            frustum.wxyz, frustum.position = so3.quaternion(pose.rotation.T), pose.position
+            frustum.wxyz, frustum.position = wxyz, position
             frustum.scale, frustum.color = scale, COLOURS[status]
-            self._labels[name].position = pose.position + 0.25 * scale * _up({name: pose})
+            self._labels[name].position = position + 0.25 * scale * _up({name: pose})
             self.frusta_moved += 1
         std_ms = 1e3 * found.time_offset_std
         sharp = f"± {std_ms:.2g} ms" if std_ms > 0.0 else "reference clock"
