@@ -15,6 +15,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from email.message import Message
 from email.parser import HeaderParser
+from fnmatch import fnmatch
 from importlib.metadata import PackageNotFoundError, metadata, requires
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,7 +34,7 @@ _COMMON_PACKAGES = (
 _LOG_PACKAGES = ("mcap", "zstandard", "foxglove-schemas-protobuf")
 ROLE_PACKAGES: dict[str, tuple[str, ...]] = {
     "camera": (*_COMMON_PACKAGES, "opencv-python-headless", "mcap"),
-    "uav": (*_COMMON_PACKAGES, "opencv-python-headless", "pymavlink", "pyserial"),
+    "uav": (*_COMMON_PACKAGES, "opencv-python-headless", "pymavlink", "pyserial", "scipy"),
     "hub": (*_COMMON_PACKAGES, *_LOG_PACKAGES, "opencv-python-headless", "scipy", "plotly", "viser"),
     "recorder": (*_COMMON_PACKAGES, *_LOG_PACKAGES),
     "router": _COMMON_PACKAGES,
@@ -41,7 +42,9 @@ ROLE_PACKAGES: dict[str, tuple[str, ...]] = {
 """Packages that a role imports; ``tests/faults/test_bundle.py`` runs each role with only these."""
 _UNUSED = ("lxml",)
 """Dependencies that no agent imports: pymavlink reads descriptions of parameters with lxml."""
-BUDGET_MB = {"camera": 350.0, "uav": 350.0}
+_LEFT_OUT = ("*/tests/*", "*/dialects/v09/*", "*/dialects/v10/*")
+"""Files of wheels that are not kept on a board: packages' own tests, and dialects of MAVLink before 2."""
+BUDGET_MB = {"camera": 350.0, "uav": 450.0}
 """Largest installed size of a role [MB], without depthai for OAK boards."""
 _PRECOMPILED_MODULES = {
     "camera": "deploy.agents.assembly, edge.offline.video, deploy.agents.systemd_notify, edge.agents.camera, "
@@ -49,7 +52,8 @@ _PRECOMPILED_MODULES = {
     "edge.devices.playback.log_playback, edge.devices.live.network, edge.devices.live.picamera, "
     "edge.devices.live.usb, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
     "uav": "deploy.agents.uav, deploy.agents.systemd_notify, edge.agents.uav, edge.mavlink.link.connection, "
-    "edge.uav.ground_tracker, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
+    "edge.uav.adaptive_tracker, edge.uav.timing.clock_alignment, scipy.interpolate, edge.devices.playback.open_video, "
+    "protocols.bus.transport.zenoh_bus",
     "hub": "deploy.agents.assembly, hub.live.agent, hub.calibration.pipeline, hub.distributed.network.host, "
     "hub.report, hub.view.server, protocols.bus.transport.zenoh_bus",
     "recorder": "deploy.agents.recorder, protocols.bus.transport.zenoh_bus",
@@ -304,10 +308,12 @@ def _identity(wheel: Path) -> tuple[str, str]:
 
 def _installed_size(wheel: Path) -> int:
     with zipfile.ZipFile(wheel) as archive:
-        return sum(item.file_size for item in archive.infolist())
+        kept = (one for one in archive.infolist() if not any(fnmatch(one.filename, rule) for rule in _LEFT_OUT))
+        return sum(item.file_size for item in kept)
 
 
 def _script(role: str, target: Target) -> str:
+    left_out = " -o ".join(f"-path '{rule}'" for rule in _LEFT_OUT)
     return f"""\
 #!/bin/sh
 # Installs Syncline {VERSION} for the role {role} from this folder, without a network.
@@ -328,6 +334,7 @@ CHECK
 for pip in "$here"/{_WHEELS}/pip-*.whl; do :; done
 "$target/bin/python" "$pip/pip" install --quiet --disable-pip-version-check --no-index --no-compile --no-deps \\
     --upgrade --require-hashes --find-links "$here/{_WHEELS}" --requirement "$here/requirements.txt"
+(cd "$target/lib" && find . \\( {left_out} \\) -delete)
 # Byte code of what the agent imports, and of nothing else: services may not write here.
 "$target/bin/python" -c "import {_PRECOMPILED_MODULES[role]}"
 echo "Syncline {VERSION} ({role}) is in $target: $(du -sm "$target" | cut -f1) MB"

@@ -20,7 +20,7 @@ def bundle(
     """Collect the wheels that a board without a network needs, and a script that installs them there.
 
     Only packages that the role imports are included. Prints the installed size; more than 350 MB for a camera (without
-    OAK) or a UAV is refused. On the board: sh install.sh
+    OAK) or 450 MB for a UAV is refused. On the board: sh install.sh
 
     Example: syncline bundle --platform aarch64 --python 3.11 --role camera --out camera-bundle
 

@@ -25,7 +25,7 @@ from protocols.core.clocks import UNSET_CLOCK_UNIX_S, utc_text
 PACKAGES: dict[str, tuple[str, ...]] = {
     "": ("numpy", "zenoh", "msgspec", "google.protobuf"),
     "camera": ("cv2",),
-    "uav": ("cv2", "pymavlink", "serial"),
+    "uav": ("cv2", "pymavlink", "scipy", "serial"),
     "hub": ("cv2", "scipy", "plotly", "mcap"),
     "recorder": ("mcap", "zstandard", "foxglove_schemas_protobuf"),
     "oak": ("depthai",),
