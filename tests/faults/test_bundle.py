@@ -80,6 +80,7 @@ def test_a_bundle_installs_without_an_index_and_its_agent_runs(
         assert sum(file.lstat().st_size for file in files) <= 1e6 * BUDGET_MB[role], ended.stdout
     # What the role does not need is not there, and it starts without it.
     packages = {path.name for path in (board / "lib" / f"python{HERE}" / "site-packages").iterdir()}
+    assert not [*board.glob("lib/**/tests/*.py")], "packages' own tests"
     assert ("plotly" in packages) == (role == "hub")
     assert ("scipy" in packages) == (role in ("hub", "uav"))
     command, text = CONFIG[role]
@@ -115,7 +116,7 @@ def test_a_bundle_installs_without_an_index_and_its_agent_runs(
 @pytest.mark.parametrize("role", sorted(BUDGET_MB))
 def test_a_board_of_another_architecture_stays_within_its_budget(role: str, tmp_path: Path) -> None:
     bundle = made(role, Target("aarch64", "3.11"), tmp_path / "bundle")
-    assert bundle.installed_mb <= BUDGET_MB[role]
+    assert bundle.installed_mb <= 350.0, "of a small computer; a UAV's x86_64 may take more, see BUDGET_MB"
     wheels = [path.name for path in (bundle.out / "wheels").glob("*.whl")]
     assert any("aarch64" in name for name in wheels)
     assert not any("x86_64" in name for name in wheels)

@@ -191,7 +191,7 @@ def test_a_clock_step_is_reported_with_time_and_size_and_no_other_clock_follows(
 
 
 def test_slow_errors_of_labels_and_of_lenses_are_no_clock_step() -> None:
-    """Errors that last for seconds, in a part of a flight, of lenses that are up to 2 % off."""
+    """Errors correlated over seconds, in a part of a flight, of lenses that are up to 2 % off."""
     one = lasting_errors.session(9102)
     found = calibrate(one.rig, one.observations)
     assert len(found.cameras) == 4

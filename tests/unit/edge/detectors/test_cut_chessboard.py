@@ -42,7 +42,7 @@ def test_a_board_that_looks_the_same_upside_down_is_not_numbered_from_a_part() -
 
 
 def test_a_board_with_a_hidden_end_is_not_numbered() -> None:
-    """A sheet hides its other end, too: no part of the board tells which it is."""
+    """A sheet hides its other end, too: no part of the board shows which it is."""
     for image, truth in cut_chessboards((9, 6), 4, 2, seed=6, covered=True):
         numbers, pixels = Finder(board()).find(image, cut=True)
         assert np.linalg.norm(pixels - truth[numbers], axis=1).max(initial=0.0) < 0.5
