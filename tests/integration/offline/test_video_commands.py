@@ -106,15 +106,25 @@ def test_the_stored_session_can_be_calibrated_again(recorded: RecordedVideos, tm
     assert (tmp_path / "trajectory.csv").read_bytes() == (recorded.out / "trajectory.csv").read_bytes()
 
 
-def test_without_intrinsics_only_the_timing_is_estimated_and_the_rest_refused(
-    recorded: RecordedVideos, tmp_path: Path, capsys: Capture
-) -> None:
-    folder, out = tmp_path / "videos", tmp_path / "out"
+@pytest.fixture(scope="module")
+def without_lenses(recorded: RecordedVideos, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
+    """The two videos without rig.toml, the output of `calibrate` and what it said on both streams."""
+    folder = tmp_path_factory.mktemp("without_lenses") / "videos"
     folder.mkdir()
     for name in ("cam0", "cam1"):
         shutil.copy2(recorded.folder / f"{name}.mp4", folder)
-    assert run(["calibrate", str(folder), "--out", str(out), "--json"]) == 3
-    assert "no intrinsics" in capsys.readouterr().err
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        assert run(["calibrate", str(folder), "--out", str(folder.parent / "out")]) == 3
+    return folder, folder.parent / "out", said.getvalue()
+
+
+def test_without_intrinsics_only_the_timing_is_estimated_and_the_rest_refused(
+    recorded: RecordedVideos, without_lenses: tuple[Path, Path, str]
+) -> None:
+    _, out, said = without_lenses
+    assert "no intrinsics" in said
+    assert "timing of cam0–cam1: lag" in said
     result = json.loads((out / "result.json").read_text())
     (pair,) = result["pairs"]
     assert abs(pair["lag_s"] - (recorded.times["cam1"][0] - recorded.times["cam0"][0])) < 5e-3
@@ -346,18 +356,13 @@ def test_videos_are_synchronised_triangulated_and_exported_to_every_format(
 
 
 def test_two_cameras_without_lenses_are_synchronised_by_timing_alone(
-    recorded: RecordedVideos, tmp_path: Path, capsys: Capture
+    recorded: RecordedVideos, without_lenses: tuple[Path, Path, str], tmp_path: Path, capsys: Capture
 ) -> None:
-    folder = tmp_path / "videos"
-    folder.mkdir()
-    for name in ("cam0", "cam1"):
-        shutil.copy(recorded.folder / f"{name}.mp4", folder)
-    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 3
-    assert "timing of cam0–cam1: lag" in capsys.readouterr().out
-    result = tmp_path / "out" / "result.json"
+    folder, out, _ = without_lenses
     arguments = ["sync", str(folder), "--videos", "none", "--json"]
-    assert run([*arguments, "--calibration", str(result), "--out", str(tmp_path / "sync")]) == 0
+    assert run([*arguments, "--calibration", str(out / "result.json"), "--out", str(tmp_path / "sync")]) == 0
     assert json.loads(capsys.readouterr().out)["reference"] == "cam0"
+    shutil.copytree(out / "session", tmp_path / "again" / "session")  # what `calibrate` detected
     assert run([*arguments, "--out", str(tmp_path / "again")]) == 0  # without a calibration: it is made
     with_poses = toml(recorded.out / "calibration.toml")["cam1"]
     for made in ("sync", "again"):
