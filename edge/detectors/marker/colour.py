@@ -51,7 +51,9 @@ class ColourModel:
         axis = (np.arange(_CELLS) + 0.5) * (256 / _CELLS) - 0.5
         cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         near = _nearest(cells, self.target)
-        return np.asarray((near < self.reject) & (near < _nearest(cells, self.other)), dtype=np.uint8)
+        found = near < self.reject
+        found[found] = near[found] < _nearest(cells[found], self.other)
+        return found.astype(np.uint8)
 
     def to_table(self) -> dict[str, Any]:
         """As plain values for a TOML table: examples as [red, green, blue]."""

@@ -34,12 +34,13 @@ def room(rays: Floats, eye: Floats, half: float, height: float, rng: np.random.G
     directions = rays.reshape(-1, 3)
     texture = _Texture(rng)
     depth, colour = _shell(directions, eye, half, height, texture, rng)
+    safe = np.ascontiguousarray(_without_zeros(directions).T)
     for _ in range(7):
-        depth, colour = _add_box(directions, eye, depth, colour, half, texture, rng)
+        _add_box(directions, safe, eye, depth, colour, half, texture, rng)
     for bgr in _BALL_BGR:
         radius = rng.uniform(0.07, 0.14)
         centre = np.array([*_by_the_wall(rng, half, 0.4), radius])
-        depth, colour = _add_ball(directions, eye, depth, colour, centre, radius, np.array(bgr, dtype=np.float64))
+        _add_ball(directions, eye, depth, colour, centre, radius, np.array(bgr, dtype=np.float64))
     return _finish(colour, rays.shape[:2])
 
 
@@ -105,7 +106,7 @@ def _shell(
 ) -> tuple[Floats, Floats]:
     """Distances (n,) and colours (n, 3) of floor, ceiling and walls."""
     low, high = np.array([-half, -half, 0.0]), np.array([half, half, height])
-    safe = np.where(np.abs(directions) < 1e-9, 1e-9, directions)
+    safe = _without_zeros(directions)
     distance = np.where(safe > 0, high - eye, low - eye) / safe
     axis = np.argmin(distance, axis=1)
     depth = distance[np.arange(len(axis)), axis]
@@ -173,45 +174,47 @@ def _paint_window(
     wall[pane] = np.array([250, 240, 225.0]) - 40.0 * np.clip(1.55 - up[pane], 0, 1)[:, None] * np.array([1, 0.5, 0.6])
 
 
+def _without_zeros(directions: Floats) -> Floats:
+    """The directions (n, 3) as divisors."""
+    return np.asarray(np.where(np.abs(directions) < 1e-9, 1e-9, directions))
+
+
 def _add_box(
     directions: Floats,
+    safe: Floats,
     eye: Floats,
     depth: Floats,
     colour: Floats,
     half: float,
     texture: _Texture,
     rng: np.random.Generator,
-) -> tuple[Floats, Floats]:
-    """Add a box on the floor by the wall, by depth test."""
+) -> None:
+    """Add a box on the floor by the wall to depth (n,) and colour (n, 3). safe: (3, n) directions as divisors."""
     bgr = np.array(_BOX_BGR[int(rng.integers(len(_BOX_BGR)))], dtype=np.float64)
     size = np.array([rng.uniform(0.2, 0.35), rng.uniform(0.2, 0.35), rng.uniform(0.2, 0.9)])
     centre = np.array([*_by_the_wall(rng, half, 0.4), 0.5 * size[2]])
-    safe = np.where(np.abs(directions) < 1e-9, 1e-9, directions)
-    a, b = (centre - 0.5 * size - eye) / safe, (centre + 0.5 * size - eye) / safe
+    a, b = (centre - 0.5 * size - eye)[:, None] / safe, (centre + 0.5 * size - eye)[:, None] / safe
     entry, leave = np.minimum(a, b), np.maximum(a, b)
-    near, axis = entry.max(axis=1), entry.argmax(axis=1)
-    hit = (near < leave.min(axis=1)) & (near > 0.05) & (near < depth)
+    near = entry.max(axis=0)
+    hit = (near < leave.min(axis=0)) & (near > 0.05) & (near < depth)
     point = eye + near[hit, None] * directions[hit]
-    light = np.array([0.75, 0.62, 1.05])[axis[hit]]
+    light = np.array([0.75, 0.62, 1.05])[entry[:, hit].argmax(axis=0)]
     marks = texture.at(point[:, 0] * 5.0 + point[:, 1] * 3.0, point[:, 2] * 5.0)
-    colour = colour.copy()
     colour[hit] = bgr * (light * (1.0 + 0.05 * marks))[:, None]
-    return np.where(hit, near, depth), colour
+    depth[hit] = near[hit]
 
 
 def _add_ball(
     directions: Floats, eye: Floats, depth: Floats, colour: Floats, centre: Floats, radius: float, bgr: Floats
-) -> tuple[Floats, Floats]:
-    """Add a ball that is not the marker, by depth test."""
-    square = (directions * directions).sum(axis=1)
-    closest = directions @ (centre - eye) / square
-    miss2 = ((eye + closest[:, None] * directions - centre) ** 2).sum(axis=1)
-    near = closest - np.sqrt(np.maximum(radius * radius - miss2, 0.0) / square)
+) -> None:
+    """Add a ball that is not the marker, by depth test. directions: (n, 3) unit vectors."""
+    closest = directions @ (centre - eye)
+    miss2 = (centre - eye) @ (centre - eye) - closest * closest
+    near = closest - np.sqrt(np.maximum(radius * radius - miss2, 0.0))
     hit = (miss2 < radius * radius) & (near > 0.05) & (near < depth)
     normal = (eye + near[hit, None] * directions[hit] - centre) / radius
-    colour = colour.copy()
     colour[hit] = bgr * (0.55 + 0.5 * np.clip(normal @ _LIGHT, 0.0, 1.0))[:, None]
-    return np.where(hit, near, depth), colour
+    depth[hit] = near[hit]
 
 
 def _finish(colour: Floats, shape: tuple[int, ...]) -> npt.NDArray[np.uint8]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import re
 import shlex
@@ -12,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.cli import COMMANDS, build_app
+from deploy.cli import COMMANDS, build_app, run
 from protocols.session.calibration import read_calibration
 
 ROOT = Path(__file__).parents[3]
@@ -37,10 +39,10 @@ def command_lines(text: str) -> list[str]:
 @cache
 def help_of(name: str) -> str:
     """What `syncline NAME --help` prints."""
-    result = subprocess.run(
-        [sys.executable, "-m", "deploy", name, "--help"], capture_output=True, text=True, check=True, cwd=ROOT
-    )
-    return result.stdout
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert run([name, "--help"]) == 0
+    return printed.getvalue()
 
 
 def in_pages() -> list[tuple[str, str]]:
