@@ -260,7 +260,7 @@ def status_message(
     )
     for name, count in hub.counters.items():
         message.counters[name] = count
-    for kind, of_cameras in (("over_budget", hub.budgets.counts), ("fault", hub.faults)):
+    for kind, of_cameras in (("over_budget", hub.budgets.counts), ("fault", hub.links.faults)):
         for camera, count in of_cameras.most_common(_NAMED_CAMERAS):
             message.counters[f"{kind}.{camera}"[:64]] = count
     ages = hub.frame_ages(now)

@@ -15,16 +15,17 @@ import numpy as np
 from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
-from hub.clocks.arrival_prior import ERROR_BOUND_S
 from hub.clocks.observation_stream import LEAST_ROWS, ObservationStream
 from hub.distributed.network.host import NodeHost
 from hub.distributed.solver import node_calibration
 from hub.live.budgets import CameraBudgets
+from hub.live.camera_links import CameraLinks
+from hub.live.job_schedule import JobSchedule
 from hub.live.messages import calibration_message, refusal_message, solver_event
+from hub.live.reloaded import VERIFY_ROWS, ReloadedCalibration
 from hub.live.solver import InlineSolver, Solver, SolverAnswer, SolverJob
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.live_tracking import LiveTracking
-from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.core.errors import InputError, Refused
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
@@ -37,35 +38,13 @@ HubState = Literal["collecting", "searching", "calibrated", "degraded", "refused
 
 _MIN_PEOPLE_S = 40.0
 """Total duration of people's tracklets [s] that two cameras need before people-based calibration is tried."""
-_SEARCH_LOAD, _UPDATE_LOAD = 0.6, 0.2
-"""CPU seconds of the solver per second before the first answer, and after it: a longer job is followed by a longer
-pause."""
-_SEARCH_EVERY_S = 4.0
-"""Between two searches for cameras that are not tied."""
-_FULL_EVERY_S, _FULL_GROWTH = 30.0, 1.5
-"""Between two searches over all lags, and the growth of rows from which lenses are decided again."""
-_FIRST_FULL_S = 60.0
-"""Until the first search over all lags where times of arrival bound them: it takes several seconds, and at a right
-arrival it finds nothing more."""
 _BEHIND_S = 10.0
 """A job that takes longer than this degrades a calibrated hub: warm ones take about a second."""
 SILENT_S = 3.0
 """A camera without a frame for longer than this degrades the hub."""
-_FORGOTTEN_S = 600.0
-"""A camera that is not calibrated is not waited for after this time without a frame."""
-_VERIFY_ROWS, _VERIFY_S = 60, 15.0
-"""Detections of two cameras that a reloaded calibration is verified with, and seconds after which it is dropped."""
 _VERIFY_EVERY_S = 0.5  # s: between two tests of a reloaded answer
-_ALL_HEARD_S = 3.0
-"""How long the other cameras of a reloaded calibration are waited for, once two are heard of."""
-_SAME_CLOCK_S = 1.0
-"""Largest change of a camera's delay against the hub's clock for a reloaded time map to be of the same clock."""
 _BUDGET_NOTICE_S = 10.0
 """How long the status names a camera that exceeded its budget."""
-_MAX_FAULTS = 3
-"""Errors that a camera's messages may raise before they are not used any more, until its agent is restarted."""
-_LEFT_OUT_S = 60.0
-"""How long a camera is left out without which the solver does not fail."""
 _MAX_STD_GROWTH = 1.5
 """An answer whose stds are larger than the present one's by this factor is not taken: its rows say less."""
 
@@ -120,15 +99,9 @@ class LiveHub:
         self._revision = 0
         self._jobs = self._superseded = 0
         self._now = 0.0
-        self._last_frame: dict[str, float] = {}
         self.counters: Counter[str] = Counter()
         self.stream = ObservationStream(self.settings.window_s)
-        self.delays: dict[str, float] = {}
-        """By camera, arrival of its newest frame on the hub's clock less its time on the camera's [s]."""
-        self._camera_time: dict[str, float] = {}
-        self._fresh: set[str] = set()
-        """Cameras whose frames have not all waited for this hub: their delays are those of the network."""
-        self._boots: dict[str, str] = {}
+        self.links = CameraLinks()
         self._clock_stepped = False
         self.guidance = CoverageMonitor()
         self._known = known
@@ -137,21 +110,13 @@ class LiveHub:
         self.finished = False
         """Whether the last job was handed over, or there is none."""
         self.budgets = CameraBudgets()
-        self.faults: Counter[str] = Counter()
-        """By camera, errors that its messages raised."""
-        self.notices: dict[str, str] = {}
-        """By camera, why it is left out."""
-        self._muted: dict[str, str] = {}
-        self._left_out, self._left_out_until = "", 0.0
-        self._suspects: list[str] = []
         self._begin()
 
     def _begin(self) -> None:
         """No observations and no result."""
         self.stream.forget()
         self.tracking = LiveTracking() if self.settings.track else None
-        self._next = self._next_search = self._next_full = 0.0
-        self._received, self._solved_at, self._full_rows = 0, -1, 0
+        self._schedule, self._received = JobSchedule(), 0
         self._submitted: SolverJob | None = None
         self._submitted_at = 0.0
         self._submitted_boots: dict[str, str] = {}
@@ -163,12 +128,7 @@ class LiveHub:
         self.calibrated_at = self._now
         """When the present calibration was estimated or, of a given one, began to be used."""
         self._solved_boot_ids: dict[str, str] = {}
-        self._unverified: Calibration | None = None
-        self._unverified_boots: dict[str, str] = {}
-        self._unverified_delays: dict[str, float] = {}
-        self._unverified_since: float | None = None
-        self._unverified_arrival: float | None = None
-        self._heard_two_at = np.inf
+        self._reloaded: ReloadedCalibration | None = None
         if self._known is not None:
             self._use_known(self._known)
 
@@ -180,7 +140,7 @@ class LiveHub:
         counted, and after some of them its messages are left out until its agent is restarted.
         """
         if isinstance(message, pb.Observation | pb.CameraInfo):
-            if self._muted.get(message.camera) == message.boot_id:
+            if self.links.is_left_out(message):
                 return
             if not self.budgets.admits_camera(message.camera):
                 self.counters["too_many_cameras"] += 1
@@ -194,17 +154,8 @@ class LiveHub:
         try:
             self._handle(message, arrival, backlog)
         except Exception as error:  # noqa: BLE001 - of whatever kind it is, it must not cost the other cameras
-            self._record_fault(message, error)
-
-    def _record_fault(self, message: Message, error: Exception) -> None:
-        self.counters["faults"] += 1
-        camera = getattr(message, "camera", "")
-        if not camera:
-            return
-        self.faults[camera] += 1
-        if self.faults[camera] >= _MAX_FAULTS:
-            self._muted[camera] = getattr(message, "boot_id", "")
-            self.notices[camera] = f"{camera} is left out until it is restarted: {type(error).__name__}: {error}"[:200]
+            self.counters["faults"] += 1
+            self.links.record_fault(message, error)
 
     def _handle(self, message: Message, arrival: float | None, backlog: bool) -> None:
         if isinstance(message, pb.AgentStatus):
@@ -215,13 +166,7 @@ class LiveHub:
             if event is not None:
                 self.counters[f"clock_{event.kind}s"] += 1
                 self._clock_stepped = True
-            if arrival is not None:
-                camera_time = message.device_time_ns / NANOSECONDS
-                if not backlog:
-                    self._fresh.add(message.camera)
-                self.delays[message.camera] = arrival - camera_time
-                self._camera_time[message.camera] = camera_time
-            self._last_frame[message.camera] = self._now
+            self.links.receive(message, self._now, arrival, backlog=backlog)
         self.guidance.handle(message)
         if self.tracking is not None:
             self.tracking.handle(message)
@@ -259,9 +204,7 @@ class LiveHub:
         delays then and now. A hub that was killed tracks again at once.
         """
         if self._known is None and self.calibration is None:
-            self._unverified_arrival = arrival
-            self._unverified, self._unverified_boots = calibration, dict(boot_ids)
-            self._unverified_delays, self._unverified_since = dict(delays), None
+            self._reloaded = ReloadedCalibration(calibration, dict(boot_ids), dict(delays), arrival)
 
     def clock_contradictions(self) -> list[str]:
         """Cameras whose external clock prior (NTP/PTP) the calibration contradicts, one line each."""
@@ -273,9 +216,9 @@ class LiveHub:
         """What is missing before solving is tried; "" if nothing."""
         cameras = self.stream.marker.cameras
         if self.unverified:
-            assert self._unverified is not None
-            rows = [self.stream.marker.rows(name) for name in self._unverified.cameras]
-            return "" if sum(count >= _VERIFY_ROWS for count in rows) >= 2 else "verifying the reloaded calibration"
+            assert self._reloaded is not None
+            rows = [self.stream.marker.rows(name) for name in self._reloaded.calibration.cameras]
+            return "" if sum(count >= VERIFY_ROWS for count in rows) >= 2 else "verifying the reloaded calibration"
         if len(cameras) < 2:
             return f"{len(cameras)} of at least 2 cameras heard of"
         rows_by_camera = {name: self.stream.marker.rows(name) for name in cameras}
@@ -315,7 +258,7 @@ class LiveHub:
             self.tracking = LiveTracking()
             if self.calibration is not None:
                 self._track_with(*self._tracked_with)
-            self.notices["tracking"] = f"tracking began anew: {type(error).__name__}: {error}"[:200]
+            self.links.notices["tracking"] = f"tracking began anew: {type(error).__name__}: {error}"[:200]
             return []
 
     def _poll(self, now: float) -> list[Message]:
@@ -343,7 +286,7 @@ class LiveHub:
     @property
     def unverified(self) -> bool:
         """Whether the present calibration was reloaded and not verified yet."""
-        return self._unverified is not None and self.calibration is not None
+        return self._reloaded is not None and self.calibration is not None
 
     def state(self, now: float) -> tuple[HubState, str]:
         """What the hub does at ``now``, and one line for a person."""
@@ -360,9 +303,7 @@ class LiveHub:
 
     def frame_ages(self, now: float) -> dict[str, float]:
         """Seconds since the last frame of each camera that is calibrated or was heard of lately."""
-        kept = {} if self.calibration is None else self.calibration.cameras
-        ages = {name: now - last for name, last in sorted(self._last_frame.items())}
-        return {name: age for name, age in ages.items() if name in kept or age < _FORGOTTEN_S}
+        return self.links.ages(now, () if self.calibration is None else self.calibration.cameras)
 
     def offset_stds(self) -> dict[str, float]:
         """Standard deviation [s] of each calibrated camera's time offset."""
@@ -382,9 +323,9 @@ class LiveHub:
         exceeding = self.budgets.exceeded(now, _BUDGET_NOTICE_S)
         if exceeding:
             out.append(f"frames left out of {_listed(exceeding)}: more than a camera may send")
-        if self._left_out:
-            out.append(f"{self._left_out} is left out: the solver failed with its rows")
-        out += [*self.notices.values()][:8]
+        if self._schedule.left_out:
+            out.append(f"{self._schedule.left_out} is left out: the solver failed with its rows")
+        out += [*self.links.notices.values()][:8]
         if self.solver.busy and now - self._submitted_at > _BEHIND_S:
             out.append(f"the solver is behind: {now - self._submitted_at:.0f} s for one job")
         return out + [text for text in (self.solver_failure, self.notice) if text]
@@ -403,7 +344,7 @@ class LiveHub:
             if state == "collecting" and not reason:
                 reason = f"{rows} of {least} detections"
             if name in tied:
-                silent = self._now - self._last_frame.get(name, self._now) > SILENT_S
+                silent = self._now - self.links.last_frame.get(name, self._now) > SILENT_S
                 state, reason = ("degraded", "no frames") if silent else ("calibrated", "")
             out.append(
                 pb.CameraProgress(
@@ -421,18 +362,18 @@ class LiveHub:
             # After a clock step, the transformed calibration is published at once, before the new segment is solved.
             self._clock_stepped = False
             return self._publish_present()
-        if self._unverified is not None and self.calibration is None:
-            reloaded = self._publish_unverified()
+        if self._reloaded is not None and self.calibration is None:
+            reloaded = self._publish_reloaded(self._reloaded)
             if reloaded:
                 return reloaded
-        if self.solver.busy or (not final and now < self._next):
+        if self.solver.busy or (not final and now < self._schedule.next):
             return []
-        self._next = now + (_VERIFY_EVERY_S if self.unverified else self.settings.interval_s)
+        self._schedule.next = now + (_VERIFY_EVERY_S if self.unverified else self.settings.interval_s)
         if self._known is not None:
             return self._publish_present(changed=False)
         if not self.settings.solve:
             return self._use_nodes()
-        if self._solved_at == self._received and not final:
+        if self._schedule.solved_at == self._received and not final:
             return []
         missing = self.missing()
         if missing:
@@ -452,38 +393,33 @@ class LiveHub:
             self.counters["bad_sessions"] += 1
             self.refusal = Refused(str(error))
             return []
-        if self._left_out and now >= self._left_out_until:
-            self._left_out = ""
-        if self._left_out in rig.cameras and len(rig.cameras) > 2:
-            rig, observations = without_camera(rig, observations, self._left_out)
+        self._schedule.readmit(now)
+        left_out = self._schedule.left_out
+        if left_out in rig.cameras and len(rig.cameras) > 2:
+            rig, observations = without_camera(rig, observations, left_out)
         source = self._source()
         boots = {name: source.boot(name) for name in rig.cameras}
         last = self._start_from(boots)
-        self._solved_at = self._received
-        rows = len(observations)
+        self._schedule.solved_at = self._received
         arrivals = self.stream.arrivals(boots)
-        untied = last is None or any(name not in last.cameras for name in observations.cameras)
-        search = untied and (final or now >= self._next_search)
-        if last is None and arrivals and not self._next_full:
-            self._next_full = now + _FIRST_FULL_S
-        full = (search and (final or now >= self._next_full)) or (
-            last is not None and rows > _FULL_GROWTH * self._full_rows
+        search, full = self._schedule.plan(
+            now,
+            final=final,
+            first=last is None,
+            untied=last is None or any(name not in last.cameras for name in observations.cameras),
+            rows=len(observations),
+            has_arrivals=bool(arrivals),
         )
-        if search:
-            self._next_search = now + _SEARCH_EVERY_S
-        if full:
-            self._next_full, self._full_rows = now + _FULL_EVERY_S, rows
-        verify = self.unverified
-        if not verify:
-            self._unverified = None  # there are enough rows for an answer of their own
+        if not self.unverified:
+            self._reloaded = None  # there are enough rows for an answer of their own
         job = SolverJob(
             self._jobs + 1,
             rig,
             observations,
-            self._unverified if verify else last,
-            search or last is None,
-            full or (last is None and not arrivals),
-            verify,
+            last if self._reloaded is None else self._reloaded.calibration,
+            search,
+            full,
+            self._reloaded is not None,
             self.stream.clock_priors.for_boots(boots),
             arrivals,
             self.settings.refine_lenses,
@@ -513,22 +449,20 @@ class LiveHub:
         """Use an answer: the calibration that it gives, or why there is none."""
         job, boots = self._submitted, self._submitted_boots
         self._submitted = None
-        load = _SEARCH_LOAD if self.calibration is None else _UPDATE_LOAD
-        self._next = max(self._next, self._submitted_at + answer.cpu_s / load)
+        self._schedule.pause(self._submitted_at, answer.cpu_s, calibrated=self.calibration is not None)
         if job is None or answer.number <= self._superseded:
             return []
         self.solver_failure = answer.reason if answer.failed else ""
         if answer.failed:
             self.counters["solver_failures"] += 1
-            self._suspect(job, now)
+            self._schedule.suspect(job, () if self.calibration is None else self.calibration.cameras, now)
             return [solver_event(job, "failed", [], answer)]
-        self._suspects = []
+        self._schedule.clear_suspects()
         event = solver_event(job, "applied", [], answer)
         if answer.calibration is None:
             self.counters["refused"] += 1
-            since = self._unverified_since
-            if job.verify and (answer.permanent or since is None or now - since > _VERIFY_S):
-                self._unverified, self.calibration = None, None  # what was reloaded does not hold any more
+            if job.verify and (answer.permanent or self._reloaded is None or self._reloaded.has_failed(now)):
+                self._reloaded, self.calibration = None, None  # what was reloaded does not hold any more
             if self.calibration is not None:
                 return [event]  # an answer that holds is not given up because new rows say little
             self.refusal = Refused(answer.reason, dict(answer.refused))
@@ -547,7 +481,7 @@ class LiveHub:
             self.counters["not_better"] += 1
             return [event]
         self.counters["verified" if job.verify else "solved"] += 1
-        self._unverified = None
+        self._reloaded = None
         self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
         self.session = job.rig, job.observations
         self._report_steps(found)
@@ -564,15 +498,6 @@ class LiveHub:
                 if at not in before:
                     self.counters["clock_steps"] += 1
                     self.stream.clocks.report_step(name, size)
-
-    def _suspect(self, job: SolverJob, now: float) -> None:
-        """Leave one camera of a job that failed out, first those without which there was an answer, each in turn."""
-        if not self._suspects:
-            tied = () if self.calibration is None else self.calibration.cameras
-            self._suspects = (
-                sorted(job.rig.cameras, key=lambda name: name in tied) if len(job.rig.cameras) > 2 else [""]
-            )
-        self._left_out, self._left_out_until = self._suspects.pop(0), now + _LEFT_OUT_S
 
     def _says_more(self, found: Calibration, moved: Mapping[str, float]) -> bool:
         """Whether a new answer has stds like the present one's or smaller, or is about other cameras or poses."""
@@ -614,41 +539,14 @@ class LiveHub:
         self._solved_boot_ids = {name: source.boot(name) for name in self.calibration.cameras}
         return self._publish_present()
 
-    def _publish_unverified(self) -> list[Message]:
+    def _publish_reloaded(self, reloaded: ReloadedCalibration) -> list[Message]:
         """Publish a reloaded answer as soon as two of its cameras are heard of on the clocks that it knows."""
-        assert self._unverified is not None
         boots = {name: boot for name in self.stream.marker.cameras if (boot := self.stream.marker.boot(name))}
-        last = self._unverified
-        heard = {name: last.cameras[name] for name in boots if name in last.cameras and name in self.delays}
-        shifts = {name: self.delays[name] - self._unverified_delays.get(name, -np.inf) for name in heard}
-        kept = {
-            name: camera
-            for name, camera in heard.items()
-            if boots[name] == self._unverified_boots.get(name) and abs(shifts[name]) < _SAME_CLOCK_S
-        }
-        if self._unverified_arrival is not None and len(kept) < len(last.cameras):
-            fresh = {
-                name: camera for name, camera in heard.items() if name in self._fresh and np.isfinite(shifts[name])
-            }
-            if len(fresh) < 2 or last.reference not in fresh:
-                return []
-            self._heard_two_at = min(self._heard_two_at, self._now)
-            if len(fresh) < len(last.cameras) and self._now < self._heard_two_at + _ALL_HEARD_S:
-                return []
-            kept = {
-                name: on_new_clock(
-                    camera,
-                    shifts[name] - shifts[last.reference],
-                    self._unverified_arrival - self._unverified_delays[name] - self._camera_time[name],
-                )
-                for name, camera in fresh.items()
-            }
-            last = self._unverified = replace(last, cameras=kept)
-        if len(kept) < 2:
-            return []  # not heard of yet, a backlog, or clocks that it does not know
-        self._unverified_since = self._now
-        self.calibration = replace(self._unverified, cameras=kept)
-        self._solved_boot_ids = {name: boots[name] for name in kept}
+        found = reloaded.on_present_clocks(boots, self.links, self._now)
+        if found is None:
+            return []
+        self.calibration = found
+        self._solved_boot_ids = {name: boots[name] for name in found.cameras}
         return self._publish_present()
 
     def _has_marker(self) -> bool:
@@ -711,19 +609,6 @@ class LiveHub:
         source = self._source()
         boots = {name: self._solved_boot_ids.get(name) or source.boot(name) for name in calibration.cameras}
         return self.stream.clocks.to_present(calibration, boots)
-
-
-def on_new_clock(camera: CameraCalibration, shift: float, elapsed: float) -> CameraCalibration:
-    """A calibrated camera whose clock, or whose reference camera's, began anew, by delays against the hub's clock.
-
-    A camera's delay is the hub's clock less its own. shift: its delay now less then, less the same of the reference
-    camera: what the hub's clock was set by meanwhile cancels. elapsed: its time then less now [s], over which its rate
-    counts. Both differ from the truth by the variation of the network's delays.
-    """
-    rate = camera.time_map.clock_rate
-    offset = camera.time_map.time_offset + shift + (rate - 1.0) * elapsed
-    std = float(np.hypot(camera.time_offset_std, ERROR_BOUND_S))
-    return replace(camera, time_map=TimeMap(rate, offset), time_offset_std=std)
 
 
 def _listed(names: Iterable[str], most: int = 16) -> str:

@@ -141,7 +141,7 @@ def test_extreme_lenses_and_surveys_are_answered_or_refused(data: st.DataObject)
         changed.append(message)
     hub = LiveHub(LiveSettings(window_s=60.0))
     assert_publishable(feed(hub, changed, batch=10**9), hub)
-    assert hub.counters["faults"] == 0, hub.notices
+    assert hub.counters["faults"] == 0, hub.links.notices
     if names == (EVIL,):
         assert hub.calibration is not None, (chosen, hub.state(0.0))
 

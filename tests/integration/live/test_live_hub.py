@@ -242,7 +242,7 @@ def test_ill_health_of_a_calibrated_hub_is_told(session: Session) -> None:
     """Cameras that fall silent, and a solver that does not answer: degraded, in the status that /readyz reports."""
     hub = LiveHub(SETTINGS)
     feed(hub, messages(session))
-    now = max(hub._last_frame.values())
+    now = max(hub.links.last_frame.values())
     assert hub.state(now)[0] == "calibrated"
     state, text = hub.state(now + 5.0)
     assert state == "degraded"

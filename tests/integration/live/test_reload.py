@@ -50,7 +50,7 @@ def kept(session: Session, tmp_path_factory: pytest.TempPathFactory) -> Path:
     play(hub, session, 0.0, 18.0)
     assert hub.calibration is not None
     assert hub.session is not None
-    store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.delays)
+    store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.links.delays)
     store.close()
     return folder
 
@@ -81,11 +81,12 @@ def test_a_killed_hub_tracks_again_within_seconds(session: Session, kept: Path) 
 
 def test_a_camera_that_was_moved_meanwhile_is_not_believed(session: Session, kept: Path) -> None:
     hub = restarted(kept)
-    reloaded = hub._unverified
+    reloaded = hub._reloaded
     assert reloaded is not None
-    pose = reloaded.cameras["cam1"].pose
-    wrong = dataclasses.replace(reloaded.cameras["cam1"], pose=Pose(pose.rotation, pose.position + np.array([0, 1, 0])))
-    hub._unverified = dataclasses.replace(reloaded, cameras={**reloaded.cameras, "cam1": wrong})
+    cameras = reloaded.calibration.cameras
+    pose = cameras["cam1"].pose
+    wrong = dataclasses.replace(cameras["cam1"], pose=Pose(pose.rotation, pose.position + np.array([0, 1, 0])))
+    reloaded.calibration = dataclasses.replace(reloaded.calibration, cameras={**cameras, "cam1": wrong})
     play(hub, session, 18.0, 22.0)
     assert hub.calibration is None or "cam1" not in hub.calibration.cameras
 
@@ -93,13 +94,13 @@ def test_a_camera_that_was_moved_meanwhile_is_not_believed(session: Session, kep
 @pytest.mark.parametrize("change", ["boots", "clocks", "other cameras"])
 def test_what_was_restarted_or_set_since_is_left_out(session: Session, kept: Path, change: str) -> None:
     hub = restarted(kept)
+    reloaded = hub._reloaded
+    assert reloaded is not None
     if change == "boots":
-        hub._unverified_boots = dict.fromkeys(hub._unverified_boots, "another")
+        reloaded.boots = dict.fromkeys(reloaded.boots, "another")
     elif change == "other cameras":
-        assert hub._unverified is not None
-        hub._unverified = dataclasses.replace(
-            hub._unverified, cameras={f"x{name}": camera for name, camera in hub._unverified.cameras.items()}
-        )
+        renamed = {f"x{name}": camera for name, camera in reloaded.calibration.cameras.items()}
+        reloaded.calibration = dataclasses.replace(reloaded.calibration, cameras=renamed)
     published = play(hub, session, 4.0, 20.0, 1e9 + (100.0 if change == "clocks" else 0.0))
     assert not hub.unverified
     assert hub.counters["verified"] == 0

@@ -158,10 +158,10 @@ def test_an_error_in_a_camera_s_messages_ends_that_camera(monkeypatch: pytest.Mo
         hub.handle(frame("bad", number))
         hub.handle(frame("good", number))
     assert hub.counters["observations"] == 10
-    assert hub.faults == {"bad": 3}
-    assert "bad is left out until it is restarted: ZeroDivisionError" in hub.notices["bad"]
+    assert hub.links.faults == {"bad": 3}
+    assert "bad is left out until it is restarted: ZeroDivisionError" in hub.links.notices["bad"]
     hub.handle(frame("bad", 0, boot_id="b1"))
-    assert hub.faults == {"bad": 4}
+    assert hub.links.faults == {"bad": 4}
 
 
 class FailsWith(InlineSolver):

@@ -1,0 +1,63 @@
+"""What a hub knows of the link to each camera: when it was last heard of, how late its frames are, its faults."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+from google.protobuf.message import Message
+
+from protocols.core.clocks import NANOSECONDS
+from protocols.messages import syncline_pb2 as pb
+
+_FORGOTTEN_S = 600.0
+"""A camera that is not calibrated is not waited for after this time without a frame."""
+_MAX_FAULTS = 3
+"""Errors that a camera's messages may raise before they are not used any more, until its agent is restarted."""
+
+
+class CameraLinks:
+    """The links of all cameras.
+
+    last_frame: hub time [s]. delays: arrival of the newest frame on the hub's clock less its time on the camera's [s];
+    camera_time: that time. fresh: cameras whose frames have not all waited for this hub: their delays are those of the
+    network. faults: errors that a camera's messages raised; notices: why it is left out.
+    """
+
+    def __init__(self) -> None:
+        self.last_frame: dict[str, float] = {}
+        self.delays: dict[str, float] = {}
+        self.camera_time: dict[str, float] = {}
+        self.fresh: set[str] = set()
+        self.faults: Counter[str] = Counter()
+        self.notices: dict[str, str] = {}
+        self._muted: dict[str, str] = {}
+
+    def receive(self, message: pb.Observation, now: float, arrival: float | None, *, backlog: bool) -> None:
+        """Note a frame; arguments as of ``LiveHub.handle``."""
+        if arrival is not None:
+            camera_time = message.device_time_ns / NANOSECONDS
+            if not backlog:
+                self.fresh.add(message.camera)
+            self.delays[message.camera] = arrival - camera_time
+            self.camera_time[message.camera] = camera_time
+        self.last_frame[message.camera] = now
+
+    def ages(self, now: float, kept: Iterable[str]) -> dict[str, float]:
+        """Seconds since the last frame of each camera of ``kept`` or heard of lately."""
+        ages = {name: now - last for name, last in sorted(self.last_frame.items())}
+        return {name: age for name, age in ages.items() if age < _FORGOTTEN_S or name in kept}
+
+    def is_left_out(self, message: pb.Observation | pb.CameraInfo) -> bool:
+        """Whether this run of the camera's agent has caused too many errors."""
+        return self._muted.get(message.camera) == message.boot_id
+
+    def record_fault(self, message: Message, error: Exception) -> None:
+        """Count an error that a message raised; after some of them its camera is left out."""
+        camera = getattr(message, "camera", "")
+        if not camera:
+            return
+        self.faults[camera] += 1
+        if self.faults[camera] >= _MAX_FAULTS:
+            self._muted[camera] = getattr(message, "boot_id", "")
+            self.notices[camera] = f"{camera} is left out until it is restarted: {type(error).__name__}: {error}"[:200]
