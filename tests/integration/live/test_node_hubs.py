@@ -22,6 +22,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.folder import write_rig
 from protocols.topics import CALIBRATION, CAMERA_INFO, NODE_STATE, OBSERVATION, STATUS
 from tests.bench.pose_worlds import SimulatedRig, cube, observe, section_4
+from tests.faults.matrix import measured
 from tests.support.node_traffic import CENTRE, Stream, info, name
 from tests.support.samples import eventually
 
@@ -170,9 +171,12 @@ def test_two_hubs_share_a_network_and_one_is_killed(tmp_path: Path) -> None:
         )
 
         hubs["b"].send_signal(signal.SIGKILL)
+        began = time.monotonic()
         assert eventually(lambda: outputs.read() or set(outputs.hosts.values()) == {"a"}, 20.0), outputs.hosts  # type: ignore[func-returns-value]
+        took = time.monotonic() - began
+        measured("hub of two killed -9: all its nodes run at the other", "≤ 5 s", f"{took:.2f} s", took <= 5.0)
         time.sleep(1.0)
-        assert outputs.within("a", world, 5, 4.0), "no observation since: the last published state is enough"
+        assert eventually(lambda: outputs.within("a", world, 5, 4.0), 10.0), "without observations: by the last states"
 
         poses = list(world.poses)
         poses[3] = Pose(so3.exp(np.array([0.0, 0.035, 0.0])) @ poses[3].rotation, poses[3].position + [3.0, 4.0, 0.0])
@@ -180,5 +184,4 @@ def test_two_hubs_share_a_network_and_one_is_killed(tmp_path: Path) -> None:
         assert cameras.publish_until(moved, rng, lambda: outputs.within("a", moved, 5, 3.0)), outputs.errors("a", moved)
 
         cameras.leave(4)
-        assert eventually(lambda: "cam4" not in outputs.errors("a", moved), 10.0)
-        assert outputs.within("a", moved, 4, 3.0)
+        assert cameras.publish_until(moved, rng, lambda: outputs.within("a", moved, 4, 3.0)), outputs.errors("a", moved)
