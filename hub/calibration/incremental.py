@@ -26,9 +26,10 @@ from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
 from hub.bundle.residuals import residual_norms
 from hub.calibration.acceptance import least_certain_camera, misfits
-from hub.calibration.pair_network import describe_failures, expected_lag, solve_new_pairs
-from hub.calibration.pair_overlap import LARGE_NETWORK
-from hub.calibration.pipeline import MAX_CLOCK_STEPS, STEP_PARAMETERS, bic_prefers, calibrate, final_adjustment
+from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, STEP_PARAMETERS, bic_prefers, final_adjustment
+from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
+from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
+from hub.calibration.pipeline import calibrate
 from hub.calibration.resection_scan import scan_resection
 from hub.calibration.result import assemble_calibration
 from hub.calibration.self_calibration import focal_prior, with_cameras, with_lens

@@ -12,21 +12,15 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hub.bundle import model_comparison
 from hub.bundle.adjustment import adjust, estimate_noise
-from hub.bundle.correlated_noise import refit_with_correlated_noise
 from hub.bundle.initialisation import (
     Reconstruction,
     place_cameras,
     reconstruct_incrementally,
     reconstruct_with_known_poses,
-    sigma_limits,
 )
-from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
-from hub.bundle.problem import AdjustmentState, CameraState, ClockStep, FreeParameters, Problem
-from hub.bundle.residuals import residual_norms
-from hub.bundle.smoothness_prior import estimate_smoothness
+from hub.bundle.problem import CameraState, FreeParameters
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.acceptance import (
     LAG_CONFLICT,
@@ -34,9 +28,9 @@ from hub.calibration.acceptance import (
     least_certain_camera,
     misfits,
     network_failure,
-    wrong_lens,
 )
-from hub.calibration.pair_network import (
+from hub.calibration.final_adjustment import final_adjustment
+from hub.calibration.pairs.pair_network import (
     Progress,
     coincide,
     describe_failures,
@@ -55,7 +49,6 @@ from hub.trajectory.image_tracks import smooth_only
 from hub.two_view.relative_pose import fundamental_from
 from protocols.core.acceptance import first_failure
 from protocols.core.errors import Refused
-from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, FixedCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -65,10 +58,6 @@ if TYPE_CHECKING:
 
 _LENS_ITERATIONS = 3  # a bound: it stops where no lens changes
 _SMALL_BODY = 4  # points of a single tag
-MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2  # steps of all clocks in one recording; Gauss-Newton steps for each
-STEP_PARAMETERS, _STEP_TOLERANCE = 2, 0.5  # time and size; what is left of a size, in stds
-_ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
-_MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 
 
 def calibrate(
@@ -431,7 +420,8 @@ def solve_with_known_poses(
         cameras, graph, prepared.rows, prepared.labels, poses, not prepared.shared_clock
     )
     problem, state, _ = adjust(reconstruction.problem, reconstruction.state)
-    converged = _with_state(reconstruction, *estimate_frame_times(problem, state))
+    problem, state = estimate_frame_times(problem, state)
+    converged = replace(reconstruction, problem=problem, state=state)
     return Solution(converged, tuple(pairs), in_rig_order(refused, prepared), inside, "joint", known=known)
 
 
@@ -474,153 +464,6 @@ def with_known_timing(prepared: PreparedSession, pairs: list[PairSolution]) -> d
 def in_rig_order(refused: dict[str, str], prepared: PreparedSession) -> dict[str, str]:
     """Reasons in the rig's order."""
     return {name: refused[name] for name in prepared.camera_order if name in refused}
-
-
-def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
-    """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
-    for _ in range(MAX_CLOCK_STEPS):
-        step = model_comparison.find_clock_step(problem, state)
-        if step is None:
-            break
-        trial, found = _with_sizes(problem, state, step)
-        # What was a step of a linear model, in noise that it explained, may be little once it is estimated.
-        if any((one.size / one.std) ** 2 < model_comparison.needed_for_a_step(problem) for one in found.clock_steps):
-            break
-        problem, state = trial, found
-    return problem, state
-
-
-def _with_sizes(problem: Problem, state: AdjustmentState, new: ClockStep) -> tuple[Problem, AdjustmentState]:
-    """Problem and state adjusted with a further clock step corrected, all sizes iterated.
-
-    A size is first of one Gauss-Newton step, which leaves a part of a large one, and of a model without this step.
-    """
-    steps, corrected = [*state.clock_steps, new], [*(one.size for one in state.clock_steps), 0.0]
-    found, trial = problem, state
-    for left in range(_STEP_ITERATIONS, -1, -1):
-        found = problem
-        for one, done in zip(steps, corrected, strict=True):
-            change = replace(one, size=one.size - done)
-            found = model_comparison.with_clock_step(found, change, state.cameras[one.camera].centre)
-        found, trial, _ = adjust(found, trial, rounds=2)
-        rest = [model_comparison.remaining_step(found, trial, one.camera, one.time) for one in steps]
-        steps = [replace(one, std=more.std) for one, more in zip(steps, rest, strict=True)]
-        if all(abs(more.size) < _STEP_TOLERANCE * more.std for more in rest) or not left:
-            break
-        steps = [replace(one, size=one.size + more.size) for one, more in zip(steps, rest, strict=True)]
-    return found, replace(trial, clock_steps=tuple(steps))
-
-
-def final_adjustment(
-    reconstruction: Reconstruction,
-    report: Progress,
-    *,
-    warm: bool = False,
-    online: bool = False,
-    refine_lenses: bool = False,
-) -> Reconstruction:
-    """The final adjustment, with readouts estimated where the data clearly support it.
-
-    refine_lenses: measured lenses may change within their tolerance where the data clearly support it; else they are
-    kept exactly. warm: the state is near the solution. online: a part of a recording that goes on. Then readouts are
-    not estimated: on the first 70 to 110 s of a real rig they came out at -34 and +42 ms with stds of 10 ms, after
-    130 s not at all. And the re-fit with correlated noise, which makes early stds honest, waits for less correlation.
-    """
-    report("adjusting", 0.75)
-    problem, state = reconstruction.problem, reconstruction.state
-    if warm and online and state.jitter is None:
-        # Near the solution the re-fit alone converges; where it does not apply, the adjustment does.
-        problem, state = estimate_frame_times(problem, state)
-        problem = model_comparison.with_crystal_rates(problem, state)
-        refitted = _refit_online(problem, state, refine_lenses)
-        if refitted[1] is not state:
-            return _with_state(reconstruction, *refitted)
-    if not online and np.any(state.sigma > sigma_limits(state)):
-        lens, step = wrong_lens(problem, state), model_comparison.find_clock_step(problem, state)
-        if lens is not None and (step is None or step.statistic < lens.statistic):
-            return reconstruction  # the camera will be left out
-    problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
-    if not (warm and online):
-        problem, state = _with_clock_steps(problem, state)
-    problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
-    problem = model_comparison.with_crystal_rates(problem, state)
-    if refine_lenses and not warm:
-        report("adjusting the lenses", 0.85)
-        freed = replace(problem, free_parameters=replace(problem.free_parameters, lens=True))
-        freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: report(text, 0.85))
-        if bic_prefers(freed_problem, freed_state, problem, state, 2 * len(state.cameras)):
-            problem, state = freed_problem, freed_state
-    if (
-        not online
-        and problem.free_parameters.clock
-        and model_comparison.are_readouts_observable(problem, state, estimate_smoothness(problem, state))
-    ):
-        report("adjusting the readouts", 0.9)
-        read_problem, read_state, _ = adjust(model_comparison.with_free_readouts(problem), state, rounds=2)
-        if any(camera.readout < 0.0 for camera in read_state.cameras) and model_comparison.are_readouts_plausible(
-            read_problem, read_state
-        ):
-            held = model_comparison.without_negative_readouts(read_problem, read_state)
-            read_problem, read_state, _ = adjust(*held, rounds=2)
-        if model_comparison.are_readouts_plausible(read_problem, read_state) and bic_prefers(
-            read_problem, read_state, problem, state, len(state.cameras)
-        ):
-            problem, state = read_problem, read_state
-    adjusted = _with_state(reconstruction, problem, state)
-    if not online and (misfits(adjusted) or wrong_lens(problem, state)):
-        return adjusted  # a camera that will be left out: its errors are no noise
-    report("correlated noise", 0.92)
-    refit = _refit_online if online else refit_with_correlated_noise
-    refitted = refit(problem, state, refine_lenses)
-    if refitted[1] is state and any(problem.crystal_rates):
-        refitted = adjust(problem, state, rounds=1, iterations=9)[:2]  # the re-fit would have applied the rates' prior
-    return _with_state(reconstruction, *refitted)
-
-
-def _refit_online(problem: Problem, state: AdjustmentState, refine_lenses: bool) -> tuple[Problem, AdjustmentState]:
-    """The re-fit with correlated noise, on a part of many rows: its cost grows with the cube of the rows a second.
-
-    Eight cameras at 30 frames a second took 17 s for 60 s; errors correlated over tenths of a second are sampled often
-    enough by a third of the rows.
-    """
-    begins, ends = zip(*((rows.time.min(), rows.time.max()) for rows in problem.rows if len(rows.time)), strict=True)
-    duration = max(float(end - begin) for begin, end in zip(begins, ends, strict=True))
-    rate = sum(len(rows.time) for rows in problem.rows) / max(duration, 1e-9)
-    every = max(1, int(np.ceil(rate / _MAX_ONLINE_ROW_RATE)))
-    thinned = problem
-    if every > 1:
-        thinned = replace(problem, rows=tuple(rows.every(every) for rows in problem.rows))
-    refitted = refit_with_correlated_noise(thinned, state, refine_lenses, _ONLINE_MIN_INFLATION)
-    return (problem, state) if refitted[1] is state else refitted
-
-
-def _with_state(reconstruction: Reconstruction, problem: Problem, state: AdjustmentState) -> Reconstruction:
-    """The reconstruction with another problem and state."""
-    return Reconstruction(reconstruction.names, reconstruction.labels, problem, state)
-
-
-def bic_prefers(
-    freed: Problem, freed_state: AdjustmentState, fixed: Problem, fixed_state: AdjustmentState, parameters: int
-) -> bool:
-    """Whether ``parameters`` more are justified (Bayesian information criterion).
-
-    It uses the robust likelihood of all rows under each solution's own noise, at the effective sample size.
-    """
-    inflation = correlation_inflation(freed, freed_state)
-    rows = sum(len(part.time) / inflation[part.camera] for part in fixed.rows)
-    gain = float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / inflation).sum())
-    return bool(gain > parameters * np.log(max(rows, 2)))
-
-
-def _deviances(problem: Problem, state: AdjustmentState) -> Floats:
-    """(cameras,) twice the negative logarithm of the likelihood of each camera's rows."""
-    total = np.zeros(len(state.cameras))
-    for part in problem.rows:
-        norms = residual_norms(part, state.cameras[part.camera], state.trajectories[part.label])
-        norms = norms[np.isfinite(norms)]
-        sigma = float(state.sigma[part.camera])
-        total[part.camera] += float(np.minimum((norms / sigma) ** 2, 25.0).sum()) + 4.0 * len(norms) * np.log(sigma)
-    return total
 
 
 def _no_pair_reason(prepared: PreparedSession, pairs: list[PairSolution], refused: dict[str, str]) -> str:

@@ -20,7 +20,7 @@ from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READO
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
-from hub.calibration.pair_network import RATE_TOLERANCE, pair_lag
+from hub.calibration.pairs.pair_network import RATE_TOLERANCE, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
 from hub.calibration.solution import Solution
 from hub.sync.hypothesis import PairSolution

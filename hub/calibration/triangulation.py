@@ -14,7 +14,7 @@ import numpy as np
 from hub.bundle.adjustment import adjust
 from hub.bundle.initialisation import Reconstruction, inlier_share, reconstruct_with_known_poses
 from hub.bundle.preprocessing import PreparedSession, prepare
-from hub.calibration.pair_network import Progress, coincide
+from hub.calibration.pairs.pair_network import Progress, coincide
 from hub.calibration.result import trajectory_tables
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from protocols.core.clocks import CameraTime

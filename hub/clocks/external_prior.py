@@ -4,7 +4,7 @@ A time service gives the offset of a camera's clock from Unix time, t_unix = t_c
 Two such cameras have a known lag, which the calibration estimates independently from the images. Where both differ by
 more than their uncertainties, a clock is wrong or a camera's time stamps are late; the image-based estimate is kept.
 Only where the images leave several lags (periodic motion) does the prior select one of them
-(`hub.calibration.pair_network`).
+(`hub.calibration.pairs.pair_network`).
 """
 
 from __future__ import annotations

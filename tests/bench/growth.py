@@ -105,7 +105,7 @@ def rig(quick: bool) -> list[Curve]:
 def pairs(quick: bool) -> list[Curve]:
     """Timing: seconds of two tracks (lags within them all), and all pairs of a number of cameras."""
     from hub.bundle.preprocessing import prepare
-    from hub.calibration.pair_network import solve_pairs
+    from hub.calibration.pairs.pair_network import solve_pairs
     from tests.bench import pair_timing
     from tests.bench.pair_trials import Regime, make_trial
     from tests.support import rigs

@@ -110,7 +110,7 @@ def run(one: Session, correlated: bool) -> Run:
     began = time.process_time()
     try:
         with mock.patch(
-            "hub.calibration.pipeline.refit_with_correlated_noise",
+            "hub.calibration.final_adjustment.refit_with_correlated_noise",
             refit_with_correlated_noise if correlated else without_refit,
         ):
             found = calibrate(one.rig, one.observations)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.bundle.preprocessing import PreparedSession, nominal_intrinsics, prepare
-from hub.calibration.pair_network import Progress, solve_one_pair
+from hub.calibration.pairs.pair_network import Progress, solve_one_pair
 from hub.calibration.people.tracklets import Tracklet, find_tracklets, people_of
 from hub.sync.pair_ranking import ranking_score
 from hub.sync.track_cache import TrackCache

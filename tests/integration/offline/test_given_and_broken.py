@@ -14,7 +14,7 @@ from hub.bundle.preprocessing import prepare
 from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations
 from hub.calibration import resection_scan
 from hub.calibration.incremental import update_calibration
-from hub.calibration.pair_network import solve_pairs
+from hub.calibration.pairs.pair_network import solve_pairs
 from hub.calibration.pipeline import calibrate, solve_network
 from hub.calibration.resection_scan import find_time_map
 from hub.calibration.triangulation import triangulate

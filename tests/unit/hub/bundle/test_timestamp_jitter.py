@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import hub.calibration.pipeline
+import hub.calibration.final_adjustment
 from hub.calibration.pipeline import calibrate
 from protocols.session.calibration import Calibration
 from tests.support import rigs
@@ -54,7 +54,9 @@ def test_jitter_is_reported_and_affects_neither_poses_nor_stds(
         off = abs(session.clock_error(name, "cam0", camera.time_map))
         assert off <= 3.5 * camera.time_offset_std
         assert camera.time_offset_std < 0.15 * std
-    monkeypatch.setattr(hub.calibration.pipeline, "estimate_frame_times", lambda problem, state, *_: (problem, state))
+    monkeypatch.setattr(
+        hub.calibration.final_adjustment, "estimate_frame_times", lambda problem, state, *_: (problem, state)
+    )
     uncorrected = calibrate(session.rig, session.observations())
     assert turn_error(session, found) < 0.6 * turn_error(session, uncorrected)
     assert turn_error(session, found) < 0.2
@@ -67,7 +69,9 @@ def test_jitter_is_reported_and_affects_neither_poses_nor_stds(
 def test_exact_timestamps_change_nothing(labels: int, monkeypatch: pytest.MonkeyPatch) -> None:
     session = jittery(SEED, 0.0, labels, outliers=0.03)
     found = calibrate(session.rig, session.observations())
-    monkeypatch.setattr(hub.calibration.pipeline, "estimate_frame_times", lambda problem, state, *_: (problem, state))
+    monkeypatch.setattr(
+        hub.calibration.final_adjustment, "estimate_frame_times", lambda problem, state, *_: (problem, state)
+    )
     uncorrected = calibrate(session.rig, session.observations())
     assert not reported_jitters(found)
     for name, camera in found.cameras.items():

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import hub.calibration.pair_network
+import hub.calibration.pairs.pair_network
 from hub.bundle.preprocessing import PreparedSession, prepare
-from hub.calibration.pair_network import _leave_to_resection, _SynchronisedGroups, solve_pairs
+from hub.calibration.pairs.pair_network import _leave_to_resection, _SynchronisedGroups, solve_pairs
 from hub.sync.hypothesis import PairSolution
 from hub.sync.pair_ranking import ranking_score
 from hub.sync.pair_solver import _PairSearch, solve_pair
@@ -75,7 +75,7 @@ def test_a_search_over_all_lags_is_made_once(monkeypatch: pytest.MonkeyPatch) ->
     """The thorough search continues from the refusal of the first one, with the same result as without it."""
     prepared = prepared_of(simulate(9, 2, 12.0, unrelated=[1]))
     rates: list[float] = []
-    search_at_rate, solve = _PairSearch.search_at_rate, hub.calibration.pair_network._solve
+    search_at_rate, solve = _PairSearch.search_at_rate, hub.calibration.pairs.pair_network._solve
 
     def counted(
         self: _PairSearch, names: tuple[str, str], rate: float, near: tuple[float, float] | None = None
@@ -91,7 +91,7 @@ def test_a_search_over_all_lags_is_made_once(monkeypatch: pytest.MonkeyPatch) ->
     assert not once.solved
     assert len(rates) > 5
     assert rates.count(1.0) == 1
-    monkeypatch.setattr(hub.calibration.pair_network, "_solve", without_previous)
+    monkeypatch.setattr(hub.calibration.pairs.pair_network, "_solve", without_previous)
     _, (again,) = solve_pairs(prepared, lambda text, share: None, thorough=True)
     assert rates.count(1.0) == 3
     assert again.status == once.status
@@ -148,7 +148,7 @@ def test_a_camera_whose_search_has_failed_waits_until_a_path_may_spare_it_the_ne
     pixels[mine] = pixels[np.random.default_rng(0).permutation(np.flatnonzero(mine))]
     prepared = prepared_of(Session(**{**_fields(session), "pixels": pixels}))
     order = [("cam0", "cam2"), ("cam0", "cam1"), ("cam1", "cam2"), ("cam1", "cam3"), ("cam0", "cam3"), ("cam2", "cam3")]
-    monkeypatch.setattr("hub.calibration.pair_network._ranked", lambda *_: order)
+    monkeypatch.setattr("hub.calibration.pairs.pair_network._ranked", lambda *_: order)
     _, pairs = solve_pairs(prepared, lambda text, share: None, thorough="first pair")
     assert all(pair.solved for pair in pairs if "cam1" not in (pair.a, pair.b))
     searched = [pair for pair in pairs if "cam1" in (pair.a, pair.b) and "not searched" not in pair.status]

@@ -9,8 +9,8 @@ import pytest
 
 from hub.bundle.preprocessing import prepare
 from hub.calibration import pair_network
-from hub.calibration.pair_network import solve_pairs
-from hub.calibration.pair_overlap import LARGE_NETWORK, candidate_pairs
+from hub.calibration.pairs.pair_network import solve_pairs
+from hub.calibration.pairs.pair_overlap import LARGE_NETWORK, candidate_pairs
 from hub.clocks.clock_graph import connected_components
 from tests.support.long_street import street
 
@@ -48,7 +48,7 @@ def test_small_networks_and_unknown_clocks_have_all_their_pairs() -> None:
 
 
 def test_the_chosen_pairs_connect_all_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hub.calibration.pair_overlap.LARGE_NETWORK", 4)
+    monkeypatch.setattr("hub.calibration.pairs.pair_overlap.LARGE_NETWORK", 4)
     monkeypatch.setattr(pair_network, "LARGE_NETWORK", 4)
     rig, observations, arrivals, _ = street(5, cameras=9, seconds=40.0)
     prepared, pairs = solve_pairs(prepare(rig, observations), lambda text, share: None, arrivals=arrivals)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hub.bundle.preprocessing import prepare
-from hub.calibration.pair_network import solve_pairs
+from hub.calibration.pairs.pair_network import solve_pairs
 from hub.sync.hypothesis import PairSolution
 from hub.sync.lag_uncertainty import LagUncertainty, estimate_lag_uncertainty, recentred
 from hub.sync.pair_solver import solve_pair

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from hub.bundle.preprocessing import PreparedSession
-from hub.calibration.pair_overlap import LARGE_NETWORK, candidate_pairs
+from hub.calibration.pairs.pair_overlap import LARGE_NETWORK, candidate_pairs
 from hub.clocks.clock_graph import connected_components
 from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior
 from hub.sync.common_clock import solve_common_clock_pair

@@ -1,0 +1,1 @@
+"""Timing of all pairs of cameras: which overlap, and what each pair says."""
