@@ -77,7 +77,8 @@ def refine_and_test(
         return solution
     found, covariance, rate_prior_std = _with_rate_prior(samples, found, noise, fixed_geometry)
     rate = 1.0 / found.inverse_rate
-    last = samples.evaluate(found.cost, rate, samples.centre - rate * found.intercept, found.geometry)
+    offset = samples.centre - rate * found.intercept
+    last = samples.evaluate(found.cost, rate, offset, found.geometry, fit.planar_residual_px)
     last = replace(
         last,
         log10_false_alarm=fit.log10_false_alarm,
