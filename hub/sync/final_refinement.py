@@ -26,7 +26,7 @@ _FIVE_POINT_SUBSET = 150  # pairs among which inliers are counted
 _CLEAR_SHARE = 0.5  # of the largest ambiguity: a bound below it is clear, whatever the robust weights may change
 _MIN_IN_FRONT = 0.95  # cheirality, less an outlier in twenty
 _MAX_LAG_CHANGE = 0.1  # s from the fit's lag
-_LIKELIHOOD_MARGIN = 6.0  # chi-square between distinguishable geometries, by effective sample size
+LIKELIHOOD_MARGIN = 6.0  # chi-square between distinguishable geometries, by effective sample size
 _MIN_RATE_SIGNIFICANCE = 5.0  # std, by effective sample size: above it the motion determines the rate
 _TYPICAL_RATE_STD = 2e-4  # prior std of a clock's rate, where the motion does not determine it
 
@@ -115,7 +115,7 @@ def _most_likely_geometry(
     """
     coarse = samples.thinned(_START_SAMPLES)
     intercept = (coarse.centre - fit.offset) / fit.rate
-    bound = _rotation_bound(coarse(1.0 / fit.rate, intercept), fit.geometry.matrix, noise)
+    bound = rotation_bound(coarse(1.0 / fit.rate, intercept), fit.geometry.matrix, noise)
     if bound < clear:
         return fit.geometry, bound
     a, b = coarse.points_at(fit.rate, fit.offset)
@@ -147,14 +147,14 @@ def _most_likely_geometry(
     if not minima:
         return fit.geometry, 0.0
     best = min(minima, key=lambda minimum: minimum.cost)
-    cost_limit = best.cost + _LIKELIHOOD_MARGIN * coarse.autocorrelation_time(best) / max(len(a), 1)
+    cost_limit = best.cost + LIKELIHOOD_MARGIN * coarse.autocorrelation_time(best) / max(len(a), 1)
     angles = [
         so3.angle_between(_rotation_of(minimum), _rotation_of(best)) for minimum in minima if minimum.cost < cost_limit
     ]
     return best.geometry, max(angles)
 
 
-def _rotation_bound(pairs: PointPairs, matrix: Floats, noise: NoiseModel) -> float:
+def rotation_bound(pairs: PointPairs, matrix: Floats, noise: NoiseModel) -> float:
     """Bound [rad] of the angle from the rotation of ``matrix`` (3, 3) to any other that is equally likely; may be inf.
 
     With Taubin's distance M / N of moments and gradients, all matrices (9,) that cost no more than a limit are a cone
@@ -171,7 +171,7 @@ def _rotation_bound(pairs: PointPairs, matrix: Floats, noise: NoiseModel) -> flo
     norm += noise.sigma_a**2 * np.kron((weight * b).T @ b, in_image)
     start = matrix.ravel() / np.linalg.norm(matrix)
     cost = start @ moments[:9, :9] @ start / (start @ norm @ start)
-    limit = cost + _LIKELIHOOD_MARGIN * (2.0 * float(autocorrelation(residual).sum()) - 1.0) / len(a)
+    limit = cost + LIKELIHOOD_MARGIN * (2.0 * float(autocorrelation(residual).sum()) - 1.0) / len(a)
     by_lag = moments[:9, 9:]
     free = by_lag @ np.linalg.pinv(moments[9:, 9:], hermitian=True) @ by_lag.T
     value, vector = np.linalg.eigh(moments[:9, :9] - free - limit * norm)
@@ -243,4 +243,4 @@ def _test_sensitivity(
     return with_tests(solution, tests, fit)
 
 
-__all__ = ["LTS_INLIER_PX", "refine_and_test"]
+__all__ = ["LIKELIHOOD_MARGIN", "LTS_INLIER_PX", "refine_and_test", "rotation_bound"]
