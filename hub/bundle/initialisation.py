@@ -267,12 +267,12 @@ def triangulate_label(
     basis = SplineBasis.covering(begins - 0.5 * spacing, ends + 0.5 * spacing, spacing)
     time, points = time[good], points[good]
     weight, rows = np.ones(len(time)), basis.weights(time)
-    control = fit_spline(basis, time, points, weight, 1e-2, rows)
+    control = fit_spline(basis, rows, points, weight, 1e-2)
     for _ in range(3):
         distance = np.linalg.norm(weighted_sums(control, *rows[:2]) - points, axis=1)
         scale = max(1.4826 * float(np.median(distance)), 1e-9)
         weight = 1.0 / (1.0 + (distance / (3.0 * scale)) ** 2)
-        control = fit_spline(basis, time, points, weight, 1e-2, rows)
+        control = fit_spline(basis, rows, points, weight, 1e-2)
     return Trajectory(basis, control)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -29,6 +30,7 @@ _MAX_LAG_CHANGE = 0.1  # s from the fit's lag
 LIKELIHOOD_MARGIN = 6.0  # chi-square between distinguishable geometries, by effective sample size
 _MIN_RATE_SIGNIFICANCE = 5.0  # std, by effective sample size: above it the motion determines the rate
 _TYPICAL_RATE_STD = 2e-4  # prior std of a clock's rate, where the motion does not determine it
+_refine_finally = partial(refine, final_width=FINAL_WIDTH)
 
 
 def refine_and_test(
@@ -63,22 +65,15 @@ def refine_and_test(
         if not solution.solved:
             return solution
         fit = replace(fit, geometry=most_likely)
-    found = refine(
-        samples,
-        fit.geometry,
-        inverse_rate * (samples.centre - fit.offset),
-        1.0,
-        noise,
-        inverse_rate=inverse_rate,
-        fixed_geometry=fixed_geometry,
-        final_width=FINAL_WIDTH,
+    intercept = inverse_rate * (samples.centre - fit.offset)
+    found = _refine_finally(
+        samples, fit.geometry, intercept, 1.0, noise, inverse_rate=inverse_rate, fixed_geometry=fixed_geometry
     )
     if found is None:
         return solution
     found, covariance, rate_prior_std = _with_rate_prior(samples, found, noise, fixed_geometry)
     rate = 1.0 / found.inverse_rate
-    offset = samples.centre - rate * found.intercept
-    last = samples.evaluate(found.cost, rate, offset, found.geometry, fit.planar_residual_px)
+    last = samples.evaluate(found.cost, rate, samples.centre - rate * found.intercept, found.geometry)
     last = replace(
         last,
         log10_false_alarm=fit.log10_false_alarm,
@@ -128,15 +123,8 @@ def _most_likely_geometry(
         starts += five_point(a, b, threshold, seed, _FIVE_POINT_SUBSET)
     minima = []
     for start in starts:
-        minimum = refine(
-            coarse,
-            start,
-            intercept,
-            1.0,
-            typical,
-            inverse_rate=1.0 / fit.rate,
-            iterations=_START_ITERATIONS,
-            final_width=FINAL_WIDTH,
+        minimum = _refine_finally(
+            coarse, start, intercept, 1.0, typical, inverse_rate=1.0 / fit.rate, iterations=_START_ITERATIONS
         )
         if (
             minimum is not None
@@ -196,15 +184,8 @@ def _with_rate_prior(
     if abs(found.inverse_rate - 1.0) >= _MIN_RATE_SIGNIFICANCE * np.sqrt(autocorrelation_time * covariance[-1, -1]):
         return found, covariance, noise.rate_prior_std
     inflation = np.sqrt(autocorrelation_time)
-    typical = refine(
-        samples,
-        found.geometry,
-        found.intercept,
-        1.0,
-        NoiseModel(noise.sigma_a * inflation, noise.sigma_b * inflation, _TYPICAL_RATE_STD),
-        fixed_geometry=fixed_geometry,
-        final_width=FINAL_WIDTH,
-    )
+    inflated = NoiseModel(noise.sigma_a * inflation, noise.sigma_b * inflation, _TYPICAL_RATE_STD)
+    typical = _refine_finally(samples, found.geometry, found.intercept, 1.0, inflated, fixed_geometry=fixed_geometry)
     if typical is None:
         return found, covariance, noise.rate_prior_std
     return typical, np.asarray(np.linalg.pinv(typical.normal, hermitian=True) / autocorrelation_time), _TYPICAL_RATE_STD

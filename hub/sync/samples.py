@@ -108,13 +108,8 @@ class Samples:
         )
         return 2.0 * float(autocorrelation(residual).sum()) - 1.0
 
-    def evaluate(
-        self, cost: float, rate: float, offset: float, geometry: TwoViewGeometry, planar_residual_px: float | None = None
-    ) -> PairFit:
-        """The alignment ``t_a = rate * t_b + offset`` with quality figures, over the samples where both tracks move.
-
-        planar_residual_px: that figure, where known.
-        """
+    def evaluate(self, cost: float, rate: float, offset: float, geometry: TwoViewGeometry) -> PairFit:
+        """The alignment ``t_a = rate * t_b + offset`` with quality figures, over the samples where both tracks move."""
         a = self.points
         b, speed = self.interpolate_b((self.time - offset) / rate)
         present = np.isfinite(b).all(axis=1)
@@ -139,10 +134,7 @@ class Samples:
         track_noise = max(float(np.median([track.sigma_px for track in tracks])) for tracks in (self.a, self.b))
         limit = max(3.0 * track_noise, 3.0) / self.settings.sigma_px
         inlier = distance < limit
-        inlier_a, inlier_b = a[moving][inlier], b[moving][inlier]
-        front = relative_pose.in_front(geometry, inlier_a, inlier_b)
-        if planar_residual_px is None:
-            planar_residual_px = _planar_residual_px(inlier_a * focal_a, inlier_b * focal_b)
+        front = relative_pose.in_front(geometry, a[moving][inlier], b[moving][inlier])
         seconds = float(count) * self.seconds_per_sample
         inliers = float(inlier.mean())
         return PairFit(
@@ -159,7 +151,7 @@ class Samples:
             parallax=relative_pose.parallax(geometry, a[moving], b[moving]),
             track_noise_px=track_noise,
             misfit=float((smoothed[inlier] ** 2).mean()) if inlier.any() else np.inf,
-            planar_residual_px=planar_residual_px,
+            planar_residual_px=_planar_residual_px(a[moving][inlier] * focal_a, b[moving][inlier] * focal_b),
         )
 
 

@@ -273,7 +273,7 @@ def _robust_fit(
         begins, ends = split_at_gaps(t[inlier], gap, part_index[inlier])
         basis = SplineBasis.spanning(begins, ends, spacing)
         rows = basis.weights(t)  # once, for the fit and for its residuals
-        control = fit_spline(basis, t, x, np.where(inlier, row_weight, 0.0), stiffness, rows)
+        control = fit_spline(basis, rows, x, np.where(inlier, row_weight, 0.0), stiffness)
         error = weighted_sums(control, *rows[:2]) - x
         residual = np.where(rows[2], np.hypot(error[:, 0], error[:, 1]) / std, np.nan)
         counts = np.diff(np.searchsorted(t[inlier], np.r_[begins, np.inf]))

@@ -18,8 +18,6 @@ SUPPORT = 4
 """Control points with non-zero weight at one time (the order of a cubic spline)."""
 _POWERS = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6.0
 """Coefficients of 1, u, u², u³ of the four weights."""
-_THIRD_DIFFERENCE = (-1.0, 3.0, -3.0, 1.0)
-"""Of four control points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,25 +200,20 @@ def normal_bands(index: Ints, weights: Floats, row_weight: Floats, size: int) ->
 
 
 def fit_spline(
-    basis: SplineBasis,
-    time: Floats,
-    values: Floats,
-    row_weight: Floats,
-    stiffness: float = 1e-6,
-    rows: tuple[Ints, Floats, Bools] | None = None,
+    basis: SplineBasis, rows: tuple[Ints, Floats, Bools], values: Floats, row_weight: Floats, stiffness: float = 1e-6
 ) -> Floats:
-    """Weighted least-squares control points (size, d) of ``values`` (n, d) at ``time`` (n,).
+    """Weighted least-squares control points (size, d) of ``values`` (n, d) at the times of `SplineBasis.weights`.
 
     stiffness: weight of squared third differences relative to one row; it only bridges empty intervals.
-    rows: `SplineBasis.weights` at ``time``, where known.
     """
-    index, weights, inside = rows or basis.weights(time)
+    index, weights, inside = rows
     used = np.where(inside, row_weight, 0.0)
     bands = normal_bands(index, weights, used, basis.size)
     intervals = basis.interval_starts()
+    third = (-1.0, 3.0, -3.0, 1.0)
     for a in range(SUPPORT):
         for b in range(a, SUPPORT):
-            bands[SUPPORT - 1 - (b - a), intervals + b] += stiffness * _THIRD_DIFFERENCE[a] * _THIRD_DIFFERENCE[b]
+            bands[SUPPORT - 1 - (b - a), intervals + b] += stiffness * third[a] * third[b]
     bands[-1] += 1e-12
     target = np.zeros((basis.size, values.shape[1]))
     for k in range(SUPPORT):

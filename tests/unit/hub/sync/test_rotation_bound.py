@@ -40,7 +40,7 @@ def lowest_cost(pairs: PointPairs, rotation: Floats, near: Floats) -> float:
 
 
 @pytest.mark.parametrize(("size", "clear"), [(2.0, True), (0.2, False)])
-def test_no_equally_likely_rotation_is_beyond_the_bound_which_large_motion_keeps_small(size: float, clear: bool) -> None:
+def test_no_equally_likely_rotation_is_beyond_the_bound(size: float, clear: bool) -> None:
     """Rotations about many axes: some others are equally likely, none of them beyond the bound."""
     for seed in range(3):
         pairs, pose = motion(size, seed)
