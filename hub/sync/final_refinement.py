@@ -110,12 +110,10 @@ def _most_likely_geometry(
     """
     coarse = samples.thinned(_START_SAMPLES)
     intercept = (coarse.centre - fit.offset) / fit.rate
-    bound = rotation_bound(coarse(1.0 / fit.rate, intercept), fit.geometry.matrix, noise)
+    pairs = coarse(1.0 / fit.rate, intercept)
+    a, b, bound = pairs.a, pairs.b, rotation_bound(pairs, fit.geometry.matrix, noise)
     if bound < clear:
         return fit.geometry, bound
-    a, b = coarse.points_at(fit.rate, fit.offset)
-    both = np.isfinite(b).all(axis=1)
-    a, b = a[both], b[both]
     typical = replace(noise, rate_prior_std=_TYPICAL_RATE_STD)
     threshold = 3.0 * min(noise.sigma_a, noise.sigma_b)
     starts = [fit.geometry]
@@ -128,17 +126,16 @@ def _most_likely_geometry(
         )
         if (
             minimum is not None
+            and isinstance(minimum.geometry, RelativePose)
             and in_front(minimum.geometry, a, b).mean() > _MIN_IN_FRONT
             and abs(minimum.intercept - intercept) < _MAX_LAG_CHANGE
         ):
-            minima.append(minimum)
+            minima.append((minimum, minimum.geometry.rotation))
     if not minima:
         return fit.geometry, 0.0
-    best = min(minima, key=lambda minimum: minimum.cost)
+    best, likeliest = min(minima, key=lambda one: one[0].cost)
     cost_limit = best.cost + LIKELIHOOD_MARGIN * coarse.autocorrelation_time(best) / max(len(a), 1)
-    angles = [
-        so3.angle_between(_rotation_of(minimum), _rotation_of(best)) for minimum in minima if minimum.cost < cost_limit
-    ]
+    angles = [so3.angle_between(rotation, likeliest) for minimum, rotation in minima if minimum.cost < cost_limit]
     return best.geometry, max(angles)
 
 
@@ -160,19 +157,12 @@ def rotation_bound(pairs: PointPairs, matrix: Floats, noise: NoiseModel) -> floa
     start = matrix.ravel() / np.linalg.norm(matrix)
     cost = start @ moments[:9, :9] @ start / (start @ norm @ start)
     limit = cost + LIKELIHOOD_MARGIN * (2.0 * float(autocorrelation(residual).sum()) - 1.0) / len(a)
-    by_lag = moments[:9, 9:]
-    free = by_lag @ np.linalg.pinv(moments[9:, 9:], hermitian=True) @ by_lag.T
+    free = moments[:9, 9:] @ np.linalg.pinv(moments[9:, 9:], hermitian=True) @ moments[9:, :9]
     value, vector = np.linalg.eigh(moments[:9, :9] - free - limit * norm)
     if value[1] <= 0.0:
         return np.inf
     off_axis = np.arccos(min(abs(float(start @ vector[:, 0])), 1.0))
     return 2.0 * float(off_axis + np.arctan(np.sqrt(max(-value[0], 0.0) / value[1])))
-
-
-def _rotation_of(found: RefinementResult) -> Floats:
-    if not isinstance(found.geometry, RelativePose):
-        raise TypeError("a fundamental matrix has no rotation")
-    return found.geometry.rotation
 
 
 def _with_rate_prior(
