@@ -27,7 +27,7 @@ from hub.clocks.clock_graph import ClockGraph
 from hub.sync.hypothesis import PairSolution, evidence
 from hub.trajectory.discrete import PointBasis, SampledTrack, merged_instants
 from hub.trajectory.image_tracks import ImageTrack
-from hub.trajectory.splines import SplineBasis, fit_spline, split_at_gaps
+from hub.trajectory.splines import SplineBasis, fit_spline, split_at_gaps, weighted_sums
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
@@ -265,13 +265,14 @@ def triangulate_label(
     begins, ends = split_at_gaps(time[good], _MAX_GAP)
     spacing = knot_spacing([cameras[name] for name in names], label)
     basis = SplineBasis.covering(begins - 0.5 * spacing, ends + 0.5 * spacing, spacing)
-    weight = np.ones(int(good.sum()))
-    control = fit_spline(basis, time[good], points[good], weight, stiffness=1e-2)
+    time, points = time[good], points[good]
+    weight, rows = np.ones(len(time)), basis.weights(time)
+    control = fit_spline(basis, rows, points, weight, 1e-2)
     for _ in range(3):
-        distance = np.linalg.norm(basis.evaluate(control, time[good]) - points[good], axis=1)
+        distance = np.linalg.norm(weighted_sums(control, *rows[:2]) - points, axis=1)
         scale = max(1.4826 * float(np.median(distance)), 1e-9)
         weight = 1.0 / (1.0 + (distance / (3.0 * scale)) ** 2)
-        control = fit_spline(basis, time[good], points[good], weight, stiffness=1e-2)
+        control = fit_spline(basis, rows, points, weight, 1e-2)
     return Trajectory(basis, control)
 
 

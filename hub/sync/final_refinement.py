@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from hub.sync.acceptance import acceptance_test, with_tests
 from hub.sync.hypothesis import PairFit, PairSolution
 from hub.sync.lag_uncertainty import estimate_lag_uncertainty, recentred
-from hub.sync.samples import Samples
+from hub.sync.samples import Samples, autocorrelation
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import SmoothTrack
-from hub.two_view.refinement import FINAL_WIDTH, NoiseModel, RefinementResult, refine
-from hub.two_view.relative_pose import RelativePose, TwoViewGeometry, five_point, in_front
+from hub.two_view.refinement import FINAL_WIDTH, NoiseModel, PointPairs, RefinementResult, refine
+from hub.two_view.relative_pose import RelativePose, TwoViewGeometry, five_point, homogeneous, in_front, sampson
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
@@ -23,11 +24,13 @@ LTS_INLIER_PX = 10.0
 _FIVE_POINT_SEEDS = 8  # random seeds of five-point hypotheses, each refined to convergence
 _START_SAMPLES, _START_ITERATIONS = 300, 60  # enough to rank the minima, which are then refined with all samples
 _FIVE_POINT_SUBSET = 150  # pairs among which inliers are counted
+_CLEAR_SHARE = 0.5  # of the largest ambiguity: a bound below it is clear, whatever the robust weights may change
 _MIN_IN_FRONT = 0.95  # cheirality, less an outlier in twenty
 _MAX_LAG_CHANGE = 0.1  # s from the fit's lag
-_LIKELIHOOD_MARGIN = 6.0  # chi-square between distinguishable geometries, by effective sample size
+LIKELIHOOD_MARGIN = 6.0  # chi-square between distinguishable geometries, by effective sample size
 _MIN_RATE_SIGNIFICANCE = 5.0  # std, by effective sample size: above it the motion determines the rate
 _TYPICAL_RATE_STD = 2e-4  # prior std of a clock's rate, where the motion does not determine it
+_refine_finally = partial(refine, final_width=FINAL_WIDTH)
 
 
 def refine_and_test(
@@ -55,22 +58,16 @@ def refine_and_test(
     inverse_rate = 1.0 / fit.rate
     has_pose = isinstance(fit.geometry, RelativePose) and not fixed_geometry
     if has_pose and s.standalone and not lts:
-        most_likely, ambiguity = _most_likely_geometry(samples, fit, noise)
+        most_likely, ambiguity = _most_likely_geometry(samples, fit, noise, _CLEAR_SHARE * s.max_rotation_ambiguity)
         reason = f"rotations {np.rad2deg(ambiguity):.0f}° apart fit the motion equally well"
         name = "angle between equally likely rotations"
         solution = with_tests(solution, [acceptance_test(name, ambiguity, s.max_rotation_ambiguity, reason)], fit)
         if not solution.solved:
             return solution
         fit = replace(fit, geometry=most_likely)
-    found = refine(
-        samples,
-        fit.geometry,
-        inverse_rate * (samples.centre - fit.offset),
-        1.0,
-        noise,
-        inverse_rate=inverse_rate,
-        fixed_geometry=fixed_geometry,
-        final_width=FINAL_WIDTH,
+    intercept = inverse_rate * (samples.centre - fit.offset)
+    found = _refine_finally(
+        samples, fit.geometry, intercept, 1.0, noise, inverse_rate=inverse_rate, fixed_geometry=fixed_geometry
     )
     if found is None:
         return solution
@@ -102,17 +99,21 @@ def refine_and_test(
     return _test_sensitivity(solution, last, samples, found, noise, rate_prior_std, s)
 
 
-def _most_likely_geometry(samples: Samples, fit: PairFit, noise: NoiseModel) -> tuple[TwoViewGeometry, float]:
+def _most_likely_geometry(
+    samples: Samples, fit: PairFit, noise: NoiseModel, clear: float
+) -> tuple[TwoViewGeometry, float]:
     """Most likely geometry of many starts near the fit's lag, and the largest angle [rad] to equally likely rotations.
 
     Distant motion hardly separates rotation and direction (bas-relief ambiguity): from one start the search ends
-    anywhere in a valley of tens of degrees, at a cost near the noise.
+    anywhere in a valley of tens of degrees, at a cost near the noise. Where a bound of that angle is below ``clear``
+    [rad], no other start is tried: the fit's geometry and the bound.
     """
     coarse = samples.thinned(_START_SAMPLES)
     intercept = (coarse.centre - fit.offset) / fit.rate
-    a, b = coarse.points_at(fit.rate, fit.offset)
-    both = np.isfinite(b).all(axis=1)
-    a, b = a[both], b[both]
+    pairs = coarse(1.0 / fit.rate, intercept)
+    a, b, bound = pairs.a, pairs.b, rotation_bound(pairs, fit.geometry.matrix, noise)
+    if bound < clear:
+        return fit.geometry, bound
     typical = replace(noise, rate_prior_std=_TYPICAL_RATE_STD)
     threshold = 3.0 * min(noise.sigma_a, noise.sigma_b)
     starts = [fit.geometry]
@@ -120,36 +121,48 @@ def _most_likely_geometry(samples: Samples, fit: PairFit, noise: NoiseModel) -> 
         starts += five_point(a, b, threshold, seed, _FIVE_POINT_SUBSET)
     minima = []
     for start in starts:
-        minimum = refine(
-            coarse,
-            start,
-            intercept,
-            1.0,
-            typical,
-            inverse_rate=1.0 / fit.rate,
-            iterations=_START_ITERATIONS,
-            final_width=FINAL_WIDTH,
+        minimum = _refine_finally(
+            coarse, start, intercept, 1.0, typical, inverse_rate=1.0 / fit.rate, iterations=_START_ITERATIONS
         )
         if (
             minimum is not None
+            and isinstance(minimum.geometry, RelativePose)
             and in_front(minimum.geometry, a, b).mean() > _MIN_IN_FRONT
             and abs(minimum.intercept - intercept) < _MAX_LAG_CHANGE
         ):
-            minima.append(minimum)
+            minima.append((minimum, minimum.geometry.rotation))
     if not minima:
         return fit.geometry, 0.0
-    best = min(minima, key=lambda minimum: minimum.cost)
-    cost_limit = best.cost + _LIKELIHOOD_MARGIN * coarse.autocorrelation_time(best) / max(len(a), 1)
-    angles = [
-        so3.angle_between(_rotation_of(minimum), _rotation_of(best)) for minimum in minima if minimum.cost < cost_limit
-    ]
+    best, likeliest = min(minima, key=lambda one: one[0].cost)
+    cost_limit = best.cost + LIKELIHOOD_MARGIN * coarse.autocorrelation_time(best) / max(len(a), 1)
+    angles = [so3.angle_between(rotation, likeliest) for minimum, rotation in minima if minimum.cost < cost_limit]
     return best.geometry, max(angles)
 
 
-def _rotation_of(found: RefinementResult) -> Floats:
-    if not isinstance(found.geometry, RelativePose):
-        raise TypeError("a fundamental matrix has no rotation")
-    return found.geometry.rotation
+def rotation_bound(pairs: PointPairs, matrix: Floats, noise: NoiseModel) -> float:
+    """Bound [rad] of the angle from the rotation of ``matrix`` (3, 3) to any other that is equally likely; may be inf.
+
+    With Taubin's distance M / N of moments and gradients, all matrices (9,) that cost no more than a limit are a cone
+    ``m^T (M - limit N) m <= 0``, whatever their starts; M is what is left when the change of the lag is free. To turn a
+    rotation by w turns the essential matrix by w / 2 at least, however the direction follows.
+    """
+    a, b = homogeneous(pairs.a), homogeneous(pairs.b)
+    residual = sampson(matrix, pairs.a, pairs.b, noise.sigma_a, noise.sigma_b)
+    weight = (1.0 / (1.0 + (residual / FINAL_WIDTH) ** 2))[:, None]
+    columns = [b[:, :, None] * a[:, None, :], pairs.velocity_b[:, :, None] * a[:, None, :]]
+    rows = np.concatenate([column.reshape(len(a), -1) for column in columns], axis=1)
+    moments, in_image = (weight * rows).T @ rows, np.diag([1.0, 1.0, 0.0])
+    norm = noise.sigma_b**2 * np.kron(in_image, (weight * a).T @ a)
+    norm += noise.sigma_a**2 * np.kron((weight * b).T @ b, in_image)
+    start = matrix.ravel() / np.linalg.norm(matrix)
+    cost = start @ moments[:9, :9] @ start / (start @ norm @ start)
+    limit = cost + LIKELIHOOD_MARGIN * (2.0 * float(autocorrelation(residual).sum()) - 1.0) / len(a)
+    free = moments[:9, 9:] @ np.linalg.pinv(moments[9:, 9:], hermitian=True) @ moments[9:, :9]
+    value, vector = np.linalg.eigh(moments[:9, :9] - free - limit * norm)
+    if value[1] <= 0.0:
+        return np.inf
+    off_axis = np.arccos(min(abs(float(start @ vector[:, 0])), 1.0))
+    return 2.0 * float(off_axis + np.arctan(np.sqrt(max(-value[0], 0.0) / value[1])))
 
 
 def _with_rate_prior(
@@ -161,15 +174,8 @@ def _with_rate_prior(
     if abs(found.inverse_rate - 1.0) >= _MIN_RATE_SIGNIFICANCE * np.sqrt(autocorrelation_time * covariance[-1, -1]):
         return found, covariance, noise.rate_prior_std
     inflation = np.sqrt(autocorrelation_time)
-    typical = refine(
-        samples,
-        found.geometry,
-        found.intercept,
-        1.0,
-        NoiseModel(noise.sigma_a * inflation, noise.sigma_b * inflation, _TYPICAL_RATE_STD),
-        fixed_geometry=fixed_geometry,
-        final_width=FINAL_WIDTH,
-    )
+    inflated = NoiseModel(noise.sigma_a * inflation, noise.sigma_b * inflation, _TYPICAL_RATE_STD)
+    typical = _refine_finally(samples, found.geometry, found.intercept, 1.0, inflated, fixed_geometry=fixed_geometry)
     if typical is None:
         return found, covariance, noise.rate_prior_std
     return typical, np.asarray(np.linalg.pinv(typical.normal, hermitian=True) / autocorrelation_time), _TYPICAL_RATE_STD
@@ -208,4 +214,4 @@ def _test_sensitivity(
     return with_tests(solution, tests, fit)
 
 
-__all__ = ["LTS_INLIER_PX", "refine_and_test"]
+__all__ = ["LIKELIHOOD_MARGIN", "LTS_INLIER_PX", "refine_and_test", "rotation_bound"]

@@ -100,9 +100,7 @@ class PairSolution:
 
 def swap_cameras(fit: PairFit) -> PairFit:
     """The same alignment with the two cameras exchanged. Raises ValueError without intrinsics."""
-    rotation = fit.pose.rotation.T
-    pose = RelativePose(rotation, -rotation @ fit.pose.direction)
-    mid_time = (fit.mid_time - fit.offset) / fit.rate
+    mid_time, pose = (fit.mid_time - fit.offset) / fit.rate, fit.pose.inverse()
     return replace(fit, rate=1.0 / fit.rate, offset=-fit.offset / fit.rate, geometry=pose, mid_time=mid_time)
 
 

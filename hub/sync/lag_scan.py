@@ -93,10 +93,7 @@ def most_active_window(track: GridTrack, seconds: float) -> GridTrack:
     begin = int(np.argmax(total[length:] - total[:-length]))
     part = slice(begin, begin + length)
     return replace(
-        track,
-        begin=track.begin + begin * track.step,
-        points=track.points[:, part],
-        weight=track.weight[:, part],
+        track, begin=track.begin + begin * track.step, points=track.points[:, part], weight=track.weight[:, part]
     )
 
 

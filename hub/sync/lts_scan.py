@@ -111,8 +111,7 @@ def _best_of_starts(
     """Score [bins], misfit and geometry (lags, 9) of each lag: the best of several random starts."""
     lags, bins = filled.shape
     per_bin = np.where(filled[:, :, None], cells / np.maximum(cells[:, :, 35:], 1e-9), 0.0)
-    count, misfit, theta = np.zeros(lags), np.full(lags, np.inf), np.zeros((lags, 9))
-    merit = np.zeros(lags)
+    merit, misfit, theta = np.zeros(lags), np.full(lags, np.inf), np.zeros((lags, 9))
     for _ in range(starts):
         use = np.zeros((lags, bins), dtype=np.bool_)
         for _ in range(_RUNS_PER_START):
@@ -132,17 +131,11 @@ def _best_of_starts(
                 cut = np.sort(cost, axis=1)[np.arange(lags), np.maximum(filled.sum(axis=1) // 3, _MIN_BINS - 2)]
                 use = filled & (costs <= np.maximum(cut, limit)[:, None])
         inlier = filled & (costs < limit)
-        total = inlier.sum(axis=1)
-        mean = np.where(inlier, costs, 0.0).sum(axis=1) / np.maximum(total, 1)
+        mean = np.where(inlier, costs, 0.0).sum(axis=1) / np.maximum(inlier.sum(axis=1), 1)
         # A bin scores by how far its cost is below the limit: three quarters of it is hardly agreement.
         value = np.where(inlier, 1.0 - costs / limit, 0.0).sum(axis=1)
         better = value > merit
-        merit[better], count[better], misfit[better], theta[better] = (
-            value[better],
-            total[better],
-            mean[better],
-            found[better],
-        )
+        merit[better], misfit[better], theta[better] = value[better], mean[better], found[better]
     return merit, misfit, theta
 
 

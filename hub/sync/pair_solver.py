@@ -475,25 +475,23 @@ class _PairSearch:
         if isinstance(start, RelativePose | FundamentalMatrix):
             yield start, 0.0
             return
-        points_a, points_b = coarse.points_at(1.0, offset)
-        both = np.isfinite(points_b).all(axis=1)
-        if both.sum() < _MIN_SAMPLES or start is None:
+        pairs = coarse(1.0, coarse.centre - offset)
+        if len(pairs.a) < _MIN_SAMPLES or start is None:
             return
         if not self.calibrated:
             yield FundamentalMatrix.of(start), 0.0
             return
-        points_a, points_b = points_a[both], points_b[both]
         threshold = 3.0 * self.s.sigma_px * initial_misfit / min(self.a[0].focal, b[0].focal)
-        yield relative_pose.decompose_essential(start, points_a, points_b), 0.0
+        yield relative_pose.decompose_essential(start, pairs.a, pairs.b), 0.0
         noise = NoiseModel(self.s.sigma_px / self.a[0].focal, self.s.sigma_px / b[0].focal, self.s.rate_prior_std)
         uncalibrated = refine(
             coarse, FundamentalMatrix.of(start), coarse.centre - offset, initial_misfit, noise, iterations=14
         )
         lower_bound = 0.0 if uncalibrated is None else uncalibrated.cost
         if uncalibrated is not None:
-            yield relative_pose.decompose_essential(uncalibrated.geometry.matrix, points_a, points_b), lower_bound
+            yield relative_pose.decompose_essential(uncalibrated.geometry.matrix, pairs.a, pairs.b), lower_bound
         for seed in range(_FIVE_POINT_SEEDS):
-            for geometry in relative_pose.five_point(points_a, points_b, threshold, seed):
+            for geometry in relative_pose.five_point(pairs.a, pairs.b, threshold, seed):
                 yield geometry, lower_bound
 
 

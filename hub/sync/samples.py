@@ -100,12 +100,8 @@ class Samples:
 
     def autocorrelation_time(self, result: RefinementResult) -> float:
         """Integrated autocorrelation time of the residuals [samples]: the number of samples per effective sample."""
-        rate = 1.0 / result.inverse_rate
-        a, b = self.points_at(rate, self.centre - rate * result.intercept)
-        present = np.isfinite(b[:, 0])
-        residual = relative_pose.sampson(
-            result.geometry.matrix, a[present], b[present], 1.0 / self.a[0].focal, 1.0 / self.b[0].focal
-        )
+        pairs, sigma = self(result.inverse_rate, result.intercept), (1.0 / self.a[0].focal, 1.0 / self.b[0].focal)
+        residual = relative_pose.sampson(result.geometry.matrix, pairs.a, pairs.b, *sigma)
         return 2.0 * float(autocorrelation(residual).sum()) - 1.0
 
     def evaluate(self, cost: float, rate: float, offset: float, geometry: TwoViewGeometry) -> PairFit:

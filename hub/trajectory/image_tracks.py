@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hub.trajectory.discrete import SampledTrack
-from hub.trajectory.splines import SplineBasis, fit_spline, split_at_gaps
+from hub.trajectory.splines import SplineBasis, fit_spline, split_at_gaps, weighted_sums
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.observations import Track as RawTrack
 
@@ -263,7 +263,7 @@ def _robust_fit(
     """Spline fit with iterative outlier rejection, on stretches split at long gaps and discontinuities."""
     inlier = good.copy()
     basis, control, sigma = None, None, np.inf
-    gap = max(gap, _BRIDGED_KNOTS * spacing)
+    gap, row_weight = max(gap, _BRIDGED_KNOTS * spacing), std**-2.0
     part_index = np.searchsorted(discontinuities, t)
     for step in range(6):
         inlier &= _in_stretches(t, inlier, gap, part_index)
@@ -272,8 +272,10 @@ def _robust_fit(
             return None
         begins, ends = split_at_gaps(t[inlier], gap, part_index[inlier])
         basis = SplineBasis.spanning(begins, ends, spacing)
-        control = fit_spline(basis, t[inlier], x[inlier], std[inlier] ** -2.0, stiffness=stiffness)
-        residual = np.linalg.norm(basis.evaluate(control, t) - x, axis=1) / std
+        rows = basis.weights(t)  # once, for the fit and for its residuals
+        control = fit_spline(basis, rows, x, np.where(inlier, row_weight, 0.0), stiffness)
+        error = weighted_sums(control, *rows[:2]) - x
+        residual = np.where(rows[2], np.hypot(error[:, 0], error[:, 1]) / std, np.nan)
         counts = np.diff(np.searchsorted(t[inlier], np.r_[begins, np.inf]))
         degrees_of_freedom = _degrees_of_freedom(counts, basis.intervals + 3, stiffness)
         n = float(count)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import solveh_banded
+from scipy.linalg.lapack import dpbsv
 
 from protocols.geometry.types import Bools, Floats, Ints
 
@@ -199,23 +199,31 @@ def normal_bands(index: Ints, weights: Floats, row_weight: Floats, size: int) ->
     return bands
 
 
-def fit_spline(basis: SplineBasis, time: Floats, values: Floats, row_weight: Floats, stiffness: float = 1e-6) -> Floats:
-    """Weighted least-squares control points (size, d) of ``values`` (n, d) at ``time`` (n,).
+def fit_spline(
+    basis: SplineBasis, rows: tuple[Ints, Floats, Bools], values: Floats, row_weight: Floats, stiffness: float = 1e-6
+) -> Floats:
+    """Weighted least-squares control points (size, d) of ``values`` (n, d) at the times of `SplineBasis.weights`.
 
     stiffness: weight of squared third differences relative to one row; it only bridges empty intervals.
     """
-    index, weights, inside = basis.weights(time)
+    index, weights, inside = rows
     used = np.where(inside, row_weight, 0.0)
     bands = normal_bands(index, weights, used, basis.size)
     intervals = basis.interval_starts()
-    third = np.tile(np.array([-1.0, 3.0, -3.0, 1.0]), (len(intervals), 1))
-    bands += normal_bands(intervals, third, np.full(len(intervals), stiffness), basis.size)
+    third = (-1.0, 3.0, -3.0, 1.0)
+    for a in range(SUPPORT):
+        for b in range(a, SUPPORT):
+            bands[SUPPORT - 1 - (b - a), intervals + b] += stiffness * third[a] * third[b]
     bands[-1] += 1e-12
     target = np.zeros((basis.size, values.shape[1]))
-    for d in range(values.shape[1]):
-        for k in range(SUPPORT):
-            target[:, d] += np.bincount(index + k, used * weights[:, k] * values[:, d], minlength=basis.size)
-    return np.asarray(solveh_banded(bands, target, check_finite=False))
+    for k in range(SUPPORT):
+        weighted = used * weights[:, k]
+        for d in range(values.shape[1]):
+            target[:, d] += np.bincount(index + k, weighted * values[:, d], minlength=basis.size)
+    _, control, info = dpbsv(bands, target, overwrite_ab=1, overwrite_b=1)  # scipy's own wrapper takes as long again
+    if info:
+        raise np.linalg.LinAlgError("the normal matrix of a spline is not positive definite")
+    return np.asarray(control)
 
 
 def split_at_gaps(time: Floats, max_gap: float, part: Ints | None = None) -> tuple[Floats, Floats]:

@@ -53,13 +53,13 @@ def fit_motion(basis: SplineBasis | PointBasis, time: Floats, turn: Floats, plac
             control[instant] = np.median(mine, axis=0) if len(mine) else values[0]
         control[len(basis.instants) :] = control[len(basis.instants) - 1]
         return BodyMotion(basis, control)
-    weight = np.ones(len(time))
-    control = fit_spline(basis, time, values, weight, stiffness=1e-2)
+    weight, rows = np.ones(len(time)), basis.weights(time)
+    control = fit_spline(basis, rows, values, weight, stiffness=1e-2)
     for _ in range(4):
         off = np.abs(basis.evaluate(control, time) - values)
         scale = np.maximum(1.4826 * np.median(off, axis=0), 1e-9)
         weight = 1.0 / (1.0 + ((off / (3.0 * scale)) ** 2).sum(axis=1))
-        control = fit_spline(basis, time, values, weight, stiffness=1e-2)
+        control = fit_spline(basis, rows, values, weight, stiffness=1e-2)
     return BodyMotion(basis, control)
 
 

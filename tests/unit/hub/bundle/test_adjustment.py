@@ -52,7 +52,7 @@ def simulated_problem(
     for label in range(labels):
         basis = SplineBasis.covering(np.array([-1.0]), np.array([7.0]), 0.4)
         grid = np.arange(-1, 7, 0.02)
-        control = fit_spline(basis, grid, random_path(rng).at(grid), np.ones(len(grid)))
+        control = fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid)))
         paths.append(Trajectory(basis, control))
         for camera, eye in enumerate(cameras):
             time = np.sort(rng.uniform(0.8, 5.2, 60))

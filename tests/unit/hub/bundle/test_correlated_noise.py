@@ -60,7 +60,7 @@ def rig(seed: int, correlated_px: float = CORRELATED, focal_scale: float = 1.0) 
     cameras = tuple(CameraState(lens, pose, 1.0, middle, middle) for lens, pose in zip(lenses, poses, strict=True))
     basis = SplineBasis.covering(np.array([-0.5]), np.array([SECONDS + 0.5]), 0.25)
     grid = np.arange(-0.5, SECONDS + 0.5, 0.02)
-    path = Trajectory(basis, fit_spline(basis, grid, random_path(rng).at(grid), np.ones(len(grid))))
+    path = Trajectory(basis, fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid))))
     rows = []
     for i, camera in enumerate(cameras):
         time: Floats = np.asarray((np.arange(int(RATE * SECONDS)) + rng.uniform()) / RATE, dtype=np.float64)

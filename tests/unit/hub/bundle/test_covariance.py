@@ -53,7 +53,7 @@ def errors() -> Errors:
         )
         basis = SplineBasis.covering(np.array([-1.0]), np.array([SECONDS + 1]), 0.25)
         grid = np.arange(-1, SECONDS + 1, 0.02)
-        path = Trajectory(basis, fit_spline(basis, grid, random_path(rng).at(grid), np.ones(len(grid))))
+        path = Trajectory(basis, fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid))))
         rows = []
         for i, camera in enumerate(cameras):
             time = np.sort(rng.uniform(0, SECONDS, 300))
@@ -97,7 +97,7 @@ def solved() -> tuple[Problem, AdjustmentState, SmoothnessPrior]:
     )
     basis = SplineBasis.covering(np.array([0.0]), np.array([6.0]), 0.3)
     grid = np.arange(0, 6, 0.02)
-    path = Trajectory(basis, fit_spline(basis, grid, random_path(rng).at(grid), np.ones(len(grid))))
+    path = Trajectory(basis, fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid))))
     rows = []
     for i, camera in enumerate(cameras):
         time = np.sort(rng.uniform(0, 6, 150))

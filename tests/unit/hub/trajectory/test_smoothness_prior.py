@@ -27,7 +27,7 @@ def two_cameras(seed: int, until: float = SECONDS, noise: float = 0.5) -> tuple[
     cameras = tuple(CameraState(lens, pose, 1.0, middle, middle) for lens, pose in zip(lenses, poses, strict=True))
     basis = SplineBasis.covering(np.array([-0.5]), np.array([SECONDS + 0.5]), 0.25)
     grid = np.arange(-0.5, SECONDS + 0.5, 0.02)
-    path = Trajectory(basis, fit_spline(basis, grid, random_path(rng).at(grid), np.ones(len(grid))))
+    path = Trajectory(basis, fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid))))
     rows = []
     for i, camera in enumerate(cameras):
         time = np.sort(rng.uniform(0, until if i else SECONDS, 300))
