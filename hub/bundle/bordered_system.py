@@ -209,5 +209,13 @@ def solve(system: BorderedSystem, damping: float, tangent: Floats | None) -> tup
 def _damped_cholesky(band: Floats, damping: float) -> Floats:
     """Cholesky band of A, damped on its diagonal. Raises LinAlgError if not positive definite."""
     band = band.copy()
-    band[-1] += damping * band[-1] + 1e-12 * float(band[-1].max(initial=1.0))
+    band[-1] += damping * band[-1] + regularisation(band[-1])
     return np.asarray(cholesky_banded(band, check_finite=False))
+
+
+def regularisation(diagonal: Floats) -> Floats:
+    """What is added to the diagonal (n,) of A, which may be singular: 1e-12 of each entry.
+
+    Not of the largest: of a path that runs out past a camera's centre it is 1e19, and every other would be held still.
+    """
+    return np.asarray(1e-12 * np.where(diagonal > 0.0, diagonal, diagonal.max(initial=1.0)))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.special import erf
 
-from hub.bundle.bordered_system import BAND, eliminate
+from hub.bundle.bordered_system import BAND, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
@@ -288,7 +288,8 @@ def _inverse_blocks(band: Floats) -> Floats:
         diagonal[row[same] // BAND, row[same] % BAND, column[same] % BAND] = values[same]
         diagonal[row[same] // BAND, column[same] % BAND, row[same] % BAND] = values[same]
         above[row[~same] // BAND, row[~same] % BAND, column[~same] % BAND] = values[~same]
-    diagonal += 1e-12 * float(band[-1].max(initial=1.0)) * np.eye(BAND)
+    on_diagonal = np.einsum("kii->ki", diagonal)
+    on_diagonal += regularisation(on_diagonal.ravel()).reshape(on_diagonal.shape)
     pivots = np.empty_like(diagonal)
     pivots[0] = np.linalg.inv(diagonal[0])
     for i in range(1, count):

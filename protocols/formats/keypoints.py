@@ -40,6 +40,7 @@ _SKELETONS = {
 }
 _COCO, _HALPE, _BODY_25, _OPENPOSE_18, _MEDIAPIPE = map(str.split, _SKELETONS.values())
 _NAMES = {17: _COCO, 18: _OPENPOSE_18, 25: _BODY_25, 26: [*_COCO, *_HALPE], 33: _MEDIAPIPE}
+_NAMES[133] = [*_COCO, *(f"point{i}" for i in range(17, 133))]  # COCO's whole body
 _LIMBS = {("hip", "knee"): 0.245, ("knee", "ankle"): 0.246}
 """Lengths over the height of a person: D. Winter, "Biomechanics and Motor Control of Human Movement", figure 4.1."""
 
@@ -118,11 +119,13 @@ def read(kind: str, paths: list[Path], camera: str | None) -> list[CameraKeypoin
                 for folder in _openpose_folders(path) if path.is_dir() else ():
                     out.append(CameraKeypoints(_name(folder, camera), folder, list(_openpose(folder))))
                 continue
+            if kind == "sleap":
+                out += _sleap(path, camera)
+                continue
             reader = {
                 "mmpose": _mmpose,
                 "coco": _coco,
                 "mediapipe": _mediapipe,
-                "sleap": _sleap,
                 "deeplabcut-h5": _deeplabcut,
             }[kind]
             out.append(CameraKeypoints(_name(path, camera), path, list(reader(path)), kind == "mediapipe"))
@@ -142,7 +145,7 @@ def read(kind: str, paths: list[Path], camera: str | None) -> list[CameraKeypoin
 def _name(path: Path, camera: str | None) -> str:
     if camera is not None:
         return camera
-    stem = path.name if path.is_dir() else path.stem
+    stem = (path.name if path.is_dir() else path.stem).removeprefix("results_")  # of MMPose's demos
     stem = re.split(r"DLC_|\.predictions|\.analysis|_(json|keypoints|openpose|detections?)$", stem)[0]
     return name_from_file(stem.rstrip("_-. ") or path.stem, path)
 
@@ -159,15 +162,14 @@ def _joint(number: int, count: int) -> str:
     return f"point{number}" if names is None else names[number]
 
 
-def _people(people: list[Any], frame: int) -> Iterator[Keypoint]:
-    """Rows of people given as (points (n, 2), scores (n,), name)."""
+def _people(people: list[Any], frame: int, names: list[str] | None = None) -> Iterator[Keypoint]:
+    """Rows of people given as (points (n, 2), scores (n,), name). names: of the points, where the file has them."""
     for number, (points, scores, name) in enumerate(people):
         points, scores = np.asarray(points, dtype=np.float64).reshape(-1, 2), np.asarray(scores, dtype=np.float64)
         for joint, ((u, v), score) in enumerate(zip(points, scores, strict=True)):
             if np.isfinite([u, v]).all() and (u, v) != (0.0, 0.0):
-                yield Keypoint(
-                    frame, name or f"p{number}", _joint(joint, len(points)), float(u), float(v), float(score)
-                )
+                label = names[joint] if names and len(names) == len(points) else _joint(joint, len(points))
+                yield Keypoint(frame, name or f"p{number}", label, float(u), float(v), float(score))
 
 
 def _openpose_folders(folder: Path) -> Iterator[Path]:
@@ -210,43 +212,60 @@ def _openpose(folder: Path) -> Iterator[Keypoint]:
 
 def _mmpose(file: Path) -> Iterator[Keypoint]:
     document = _json(file)
-    names: dict[str, str] = {}
+    names: list[str] = []
     if isinstance(document, dict):
-        names = document.get("meta_info", {}).get("keypoint_id2name", {})
+        given = document.get("meta_info", {}).get("keypoint_id2name", {})
+        names = [given.get(str(joint), f"point{joint}") for joint in range(len(given))]
         document = document["instance_info"]
     # frame_id counts from 1 in results of videos and from 0 in others: the list's order counts.
     for number, frame in enumerate(document):
-        for k, one in enumerate(frame["instances"]):
-            points, name = one["keypoints"], f"p{one.get('track_id', k)}"
-            scores = one.get("keypoint_scores", [1.0] * len(points))
-            for joint, ((u, v), score) in enumerate(zip(points, scores, strict=True)):
-                label = names.get(str(joint), _joint(joint, len(points)))
-                yield Keypoint(number, name, label, float(u), float(v), float(score))
+        people = [
+            (
+                one["keypoints"],
+                one.get("keypoint_scores", [1.0] * len(one["keypoints"])),
+                f"p{one['track_id']}" if "track_id" in one else "",
+            )
+            for one in frame["instances"]
+        ]
+        yield from _people(people, number, names)
 
 
 def _coco(file: Path) -> Iterator[Keypoint]:
     document = _json(file)
     frames: dict[Any, int] = {}
-    names: list[str] = []
+    names: dict[Any, list[str]] = {}
     annotations = document
     if isinstance(document, dict):
-        ordered = sorted(document["images"], key=lambda image: str(image.get("file_name", image["id"])))
-        frames = {image["id"]: number for number, image in enumerate(ordered)}
-        names = document.get("categories", [{}])[0].get("keypoints", [])
+        frames = _frames_of_images(document["images"], file)
+        names = {one.get("id"): one.get("keypoints", []) for one in document.get("categories", [])}
         annotations = document["annotations"]
-    seen: dict[int, list[Any]] = {}
+    seen: dict[tuple[int, Any], list[Any]] = {}
     for one in annotations:
         values = np.asarray(one["keypoints"], dtype=np.float64).reshape(-1, 3)
         image = one["image_id"]
-        frame = frames[image] if frames else int(re.findall(r"\d+", str(image))[-1])
+        frame = frames[image] if frames else int(re.findall(r"\d+", Path(str(image)).stem)[-1])
         # The third number is COCO's visibility 0, 1, 2 in annotations and a score in results.
         score = np.clip(values[:, 2], 0.0, 1.0)
         track = one.get("track_id")
-        seen.setdefault(frame, []).append((values[:, :2], score, "" if track is None else f"p{track}"))
-    for frame in sorted(seen):
-        for row in _people(seen[frame], frame):
-            place = _COCO.index(row.joint) if row.joint in _COCO else -1
-            yield row._replace(joint=names[place]) if 0 <= place < len(names) else row
+        found = values[:, :2], score, "" if track is None else f"p{track}"
+        seen.setdefault((frame, one.get("category_id")), []).append(found)
+    for frame, category in sorted(seen, key=lambda key: key[0]):
+        yield from _people(seen[frame, category], frame, names.get(category))
+
+
+def _frames_of_images(images: list[Any], file: Path) -> dict[Any, int]:
+    """The frame of each of COCO's images by its id: the last number in its file's name, or where these go on without a
+    gap (from 1, say) its place among them; by the names' order where they have no numbers of their own."""
+    files = [Path(str(image.get("file_name", image["id"]))) for image in images]
+    folders = sorted({str(one.parent) for one in files})
+    numbers = [int((re.findall(r"\d+", one.stem) or ["-1"])[-1]) for one in files]
+    distinct = len(set(numbers)) == len(files)
+    if len(folders) > 1 and not distinct:
+        what = f"its images are of several folders ({', '.join(folders)[:80]})"
+        raise InputError(what, file=file, remedy="export one file a camera")
+    order = sorted(range(len(files)), key=lambda k: (numbers[k] if distinct else 0, str(files[k])))
+    gaps = distinct and max(numbers, default=0) - min(numbers, default=0) >= len(files)
+    return {images[k]["id"]: numbers[k] if gaps else place for place, k in enumerate(order)}
 
 
 def _mediapipe(file: Path) -> Iterator[Keypoint]:
@@ -281,31 +300,50 @@ def _hdf5_format(file: Path) -> str | None:
         raise InputError(f"not HDF5: {str(error)[:80]}", file=file, remedy="give the tracker's own file") from None
 
 
-def _sleap(file: Path) -> Iterator[Keypoint]:
+def _sleap(file: Path, camera: str | None) -> list[CameraKeypoints]:
+    """SLEAP's analysis of one video, or the videos of its project file."""
     with _h5py().File(file, "r") as data:
-        if "tracks" not in data:
-            yield from _slp(data)
-            return
-        tracks = np.asarray(data["tracks"], dtype=np.float64)  # tracks, 2, nodes, frames
-        names = [_text(name) for name in data["node_names"]]
-        scores = np.asarray(data["point_scores"]) if "point_scores" in data else np.ones(tracks[:, 0].shape)
-        several = tracks.shape[0] > 1
-        for person in range(tracks.shape[0]):
-            node, frame = np.nonzero(np.isfinite(tracks[person]).all(axis=0))
-            for n, f in zip(node.tolist(), frame.tolist(), strict=True):
-                score = float(scores[person, n, f]) if np.isfinite(scores[person, n, f]) else 1.0
-                u, v = tracks[person, :, n, f].tolist()
-                yield Keypoint(f, f"p{person}" if several else "p0", names[n], u, v, min(score, 1.0))
+        if "tracks" in data:
+            return [CameraKeypoints(_name(file, camera), file, list(_sleap_analysis(data)))]
+        videos = _slp(data)
+        if len(videos) < 2:
+            return [CameraKeypoints(_name(file, camera), file, rows) for rows in videos.values()]
+        about = [json.loads(_text(one)) for one in data["videos_json"]]
+        names = [str(one.get("filename") or one["backend"]["filename"]).replace("\\", "/") for one in about]
+        return [CameraKeypoints(_name(Path(names[video]), camera), file, rows) for video, rows in videos.items()]
 
 
-def _slp(data: Any) -> Iterator[Keypoint]:
-    """SLEAP's own project file: frames, instances, points."""
+def _sleap_analysis(data: Any) -> Iterator[Keypoint]:
+    tracks = _in_order(data["tracks"], ["track", "xy", "node", "frame"])
+    names = [_text(name) for name in data["node_names"]]
+    scores = np.ones(tracks[:, 0].shape)
+    if "point_scores" in data:
+        scores = _in_order(data["point_scores"], ["track", "node", "frame"])
+    for person in range(tracks.shape[0]):
+        node, frame = np.nonzero(np.isfinite(tracks[person]).all(axis=0))
+        for n, f in zip(node.tolist(), frame.tolist(), strict=True):
+            score = float(scores[person, n, f]) if np.isfinite(scores[person, n, f]) else 1.0
+            u, v = tracks[person, :, n, f].tolist()
+            yield Keypoint(f, f"p{person}", names[n], u, v, min(score, 1.0))
+
+
+def _in_order(dataset: Any, axes: list[str]) -> Floats:
+    """An array with its axes in SLEAP's order; sleap-io's files may have another one, and name it."""
+    given = dataset.attrs.get("dims")
+    dims = axes if given is None else json.loads(_text(given))
+    return np.asarray(dataset, dtype=np.float64).transpose([dims.index(axis) for axis in axes])
+
+
+def _slp(data: Any) -> dict[int, list[Keypoint]]:
+    """SLEAP's own project file, by video: frames, instances, points."""
     about = json.loads(_text(data["metadata"].attrs["json"]))
     order = [link["id"] for link in about["skeletons"][0]["nodes"]]
     names = [about["nodes"][number]["name"] for number in order]
     # Before format 1.1 the centre of the top-left pixel was (0.5, 0.5).
     shift = 0.5 if float(data["metadata"].attrs.get("format_id", 1.2)) < 1.1 else 0.0
+    out: dict[int, list[Keypoint]] = {}
     for frame in data["frames"][:]:
+        rows = out.setdefault(int(frame["video"]), [])
         instances = data["instances"][int(frame["instance_id_start"]) : int(frame["instance_id_end"])]
         for number, one in enumerate(instances):
             predicted = int(one["instance_type"]) == 1
@@ -317,7 +355,8 @@ def _slp(data: Any) -> Iterator[Keypoint]:
                     score = float(point["score"]) if predicted else 1.0
                     person = f"p{track if track >= 0 else number}"
                     u, v = float(point["x"]) - shift, float(point["y"]) - shift
-                    yield Keypoint(int(frame["frame_idx"]), person, name, u, v, min(score, 1.0))
+                    rows.append(Keypoint(int(frame["frame_idx"]), person, name, u, v, min(score, 1.0)))
+    return out
 
 
 def _deeplabcut(file: Path) -> Iterator[Keypoint]:

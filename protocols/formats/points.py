@@ -32,6 +32,7 @@ _LAYOUTS = {
     "Syncline's observations.csv": "camera frame time u v",
     "Syncline's boxes.csv": "camera frame time x y width height",
     "DeepLabCut's CSV": "scorer bodyparts coords",
+    "SLEAP's CSV, of which the .h5 or .slp file is read": "track frame_idx instance.score",
     "ROS' camera_info": "image_width image_height camera_name camera_matrix distortion_model distortion_coefficients",
     "OpenCV's calibration": "camera_matrix distortion_coefficients image_width image_height",
     "Kalibr's camchain": "camera_model intrinsics distortion_model distortion_coeffs resolution",
@@ -88,8 +89,10 @@ def nearest_layout(text: str) -> str:
         missing = [column for column in wanted if column not in header]
         found.append((len(missing) / len(wanted), name, missing))
     share, name, missing = min(found)
-    if share > 0.5 or not missing:
+    if share > 0.5:
         return ""
+    if not missing:
+        return f"looks like {name}"
     part = "key" if keys else "row" if name == "DeepLabCut's CSV" else "column"
     return f"looks like {name}, but {part} {', '.join(missing).rstrip('.')} is missing"
 
@@ -192,7 +195,7 @@ def _deeplabcut(file: Path, camera: str, rows: _Rows, least: float) -> None:
     for line, cells in table[head:]:
         if len(cells) != width:
             raise InputError(f"{len(cells)} columns of {width}", file=file, line=line, remedy="complete the row")
-        frame = _frame(cells[0], file, line)
+        frame = _frame(cells[starts[0] - 1], file, line)  # of labelled images, folder and file are two columns
         for column in starts:
             if not cells[column].strip() or not cells[column + 1].strip():
                 continue

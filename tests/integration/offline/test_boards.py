@@ -146,6 +146,14 @@ def test_every_print_is_recognised_and_gives_the_same_corners(
     assert np.abs(60 * points + 59.5 - pixels).max() < 1.0
 
 
+def test_a_board_is_compared_with_its_own_markers_only() -> None:
+    board = Board("charuco", (8, 6), "4X4_1000", inverted=False, mirrored=False, legacy=False)
+    detector = Finder(board)._charuco
+    assert detector is not None
+    assert len(detector.getBoard().getDictionary().bytesList) == 24
+    assert len(Finder(board).find(boards.charuco_image())[0]) == 35
+
+
 def test_a_chessboard_has_one_order_of_its_corners_also_upside_down() -> None:
     board = next(iter(Board("chessboard", (8, 5)).prints()))
     squares = (np.indices((5, 8)).sum(axis=0) % 2 * 255).astype(np.uint8)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
+from protocols.core.errors import InputError
 from protocols.formats import keypoints
 from protocols.geometry.types import Floats
 from protocols.session.calibration import read_calibration
@@ -125,6 +126,111 @@ def test_every_format_is_recognised_and_gives_the_same_points(
     assert track.pixels == pytest.approx(truth[:, 5, :2])
     assert 2 not in seen.tracks[camera, "point3" if make is freemocap else "left_ear"].frame
     assert "size = [\n    640,\n    480,\n]" in (out.parent / "rig.toml").read_text()
+
+
+def test_sleap_ios_axes_in_another_order_are_read_by_their_names(tmp_path: Path) -> None:
+    import h5py
+
+    file = sleap(tmp_path)
+    (before,) = keypoints.read("sleap", [file], None)
+    with h5py.File(file, "a") as data:
+        for name, axes, order in (
+            ("tracks", ["frame", "track", "node", "xy"], (3, 0, 2, 1)),
+            ("point_scores", ["frame", "track", "node"], (2, 0, 1)),
+        ):
+            values = np.asarray(data[name]).transpose(order)
+            del data[name]
+            data[name] = values
+            data[name].attrs["dims"] = json.dumps(axes)
+    (after,) = keypoints.read("sleap", [file], None)
+    assert sorted(after.rows) == sorted(before.rows)
+
+
+def test_the_videos_of_a_sleap_project_are_cameras(tmp_path: Path) -> None:
+    import h5py
+
+    file = tmp_path / "project.slp"
+    frames = [("frame_id", "u8"), ("video", "u4"), ("frame_idx", "u8")]
+    frames += [("instance_id_start", "u8"), ("instance_id_end", "u8")]
+    instances = [("instance_type", "u1"), ("track", "i4"), ("point_id_start", "u8"), ("point_id_end", "u8")]
+    skeleton = {"nodes": [{"name": "tail"}], "skeletons": [{"nodes": [{"id": 0}]}]}
+    with h5py.File(file, "w") as data:
+        data.create_group("metadata").attrs["json"] = json.dumps(skeleton)
+        data["videos_json"] = [
+            json.dumps(one) for one in ({"filename": "left.mp4"}, {"backend": {"filename": "D:\\a\\right.mp4"}})
+        ]
+        data["frames"] = np.array([(0, 0, 7, 0, 1), (1, 1, 7, 1, 2)], dtype=frames)
+        data["instances"] = np.array([(0, -1, 0, 1), (0, -1, 1, 2)], dtype=instances)
+        data["points"] = np.array([(10, 20, True), (30, 40, True)], dtype=[("x", "f8"), ("y", "f8"), ("visible", "?")])
+    found = {
+        one.camera: [(row.frame, row.u, row.v) for row in one.rows] for one in keypoints.read("sleap", [file], None)
+    }
+    assert found == {"left": [(7, 10.0, 20.0)], "right": [(7, 30.0, 40.0)]}
+
+
+def coco_of(folder: Path, files: list[str], joints: list[str]) -> Path:
+    """A file whose annotation of image k is at (10 k + 1 + joint, 5)."""
+    images = [{"id": 100 + k, "file_name": name} for k, name in enumerate(files)]
+    found = [
+        {
+            "image_id": 100 + k,
+            "category_id": 3,
+            "keypoints": [v for j in range(len(joints)) for v in (10 * k + 1 + j, 5, 2)],
+        }
+        for k in range(len(files))
+    ]
+    categories = [{"id": 1, "name": "ball"}, {"id": 3, "keypoints": joints}]
+    return written(folder / "cam1.json", {"images": images, "annotations": found, "categories": categories})
+
+
+@pytest.mark.parametrize(
+    ("files", "frames"),
+    [
+        ([f"frame_{k}.jpg" for k in range(12)], range(12)),  # 10 comes after 2
+        ([f"frame_{k}.jpg" for k in range(1, 13)], range(12)),
+        ([f"{5 * k}.jpg" for k in range(12)], range(0, 60, 5)),
+        ([f"shot {chr(97 + k)}.jpg" for k in range(12)], range(12)),
+    ],
+)
+def test_coco_images_are_frames_by_the_numbers_in_their_names(tmp_path: Path, files: list[str], frames: range) -> None:
+    joints = [f"own{k}" for k in range(25)]  # as many as OpenPose's
+    (found,) = keypoints.read("coco", [coco_of(tmp_path, files, joints)], None)
+    assert [row.frame for row in found.rows if row.joint == "own0"] == list(frames)
+    assert [row.u for row in found.rows if row.joint == "own0"] == [10.0 * k + 1 for k in range(12)]
+    assert [row.joint for row in found.rows[:25]] == joints
+
+
+def test_coco_images_of_several_cameras_are_not_mixed(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"several folders \(cam1, cam2\)"):
+        keypoints.read("coco", [coco_of(tmp_path, ["cam1/1.png", "cam2/1.png"], ["nose"])], None)
+
+
+def test_results_of_mmposes_demo_are_named_after_the_video_and_may_lack_points(tmp_path: Path) -> None:
+    person = {"keypoints": [[float("nan")] * 2, [3.0, 4.0]], "keypoint_scores": [0.9, 0.9]}
+    about = {"keypoint_id2name": {"0": "nose", "1": "tail"}}
+    document = {"meta_info": about, "instance_info": [{"frame_id": 1, "instances": [person]}]}
+    (found,) = keypoints.read("mmpose", [written(tmp_path / "results_cam1.json", document)], None)
+    assert found.camera == "cam1"
+    assert [(row.joint, row.u) for row in found.rows] == [("tail", 3.0)]
+
+
+def test_sleaps_csv_is_known_by_name(tmp_path: Path, capsys: Capture) -> None:
+    file = tmp_path / "cam1.analysis.csv"
+    file.write_text("track,frame_idx,instance.score,nose.x,nose.y,nose.score\n,0,0.9,1,2,0.9\n")
+    assert run(["import", str(file), "--fps", "25", "--out", str(tmp_path / "observations.csv")]) == 2
+    assert "looks like SLEAP's CSV, of which the .h5 or .slp file is read" in capsys.readouterr().err
+
+
+def test_deeplabcuts_labelled_images_are_read(tmp_path: Path) -> None:
+    file = tmp_path / "cam1.csv"
+    file.write_text(
+        "scorer,,,me,me\nbodyparts,,,nose,nose\ncoords,,,x,y\nlabeled-data,cam1,img0003.png,1,2\n"
+        "labeled-data,cam1,img0012.png,,\nlabeled-data,cam1,img0014.png,3,4\n"
+    )
+    out = tmp_path / "observations.csv"
+    assert run(["import", str(file), "--fps", "25", "--size", "640x480", "--out", str(out)]) == 0
+    (track,) = read_observations(out, ["cam1"]).tracks.values()
+    assert track.frame.tolist() == [3, 14]
 
 
 def test_deeplabcuts_hdf5_is_read_as_pandas_wrote_it(tmp_path: Path) -> None:

@@ -282,6 +282,16 @@ def test_inverse_blocks_equal_those_of_the_dense_inverse() -> None:
         np.testing.assert_allclose(block[mask], padded[part, part][mask], rtol=1e-3, atol=1e-4 * np.abs(inverse).max())
 
 
+def test_a_path_past_a_cameras_centre_leaves_the_stds_and_steps_of_others_as_they_are() -> None:
+    problem, state, prior = simulated_problem(7)
+    system, _ = build_system(problem, state, prior, robust=False)
+    before, step = _inverse_blocks(system.band), solve(system, 0.0, gauge_tangent(problem, state))[0]
+    system.band[-1, -1] = 1e25 * system.band[-1].max()
+    after, held = _inverse_blocks(system.band), solve(system, 0.0, gauge_tangent(problem, state))[0]
+    np.testing.assert_allclose(after[0, :BAND, :BAND], before[0, :BAND, :BAND], rtol=0.1)
+    assert np.linalg.norm(held[:BAND]) > 0.1 * np.linalg.norm(step[:BAND])
+
+
 def test_the_schur_complement_equals_the_dense_one() -> None:
     problem, state, prior = simulated_problem(8)
     system, _ = build_system(problem, state, prior, robust=False)
