@@ -214,5 +214,5 @@ def _damped_cholesky(band: Floats, damping: float) -> Floats:
 
 
 def regularisation(diagonal: Floats) -> Floats:
-    """(n,) 1e-12 of each entry of A's diagonal: of a path past a camera's centre the largest is 1e19, and holds others."""
+    """(n,) 1e-12 of each entry of A's diagonal: of a path past a camera's centre the largest is 1e19 and holds all."""
     return np.asarray(1e-12 * np.where(diagonal > 0.0, diagonal, diagonal.max(initial=1.0)))
