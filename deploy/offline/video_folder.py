@@ -23,7 +23,7 @@ from deploy.offline.recognition import DETECTORS, Target, find_target
 from deploy.offline.single_target import rows_of_one_target
 from edge.detectors import base as detector_base
 from edge.detectors.base import Detector, Kind
-from edge.detectors.board.description import Board
+from edge.detectors.board.description import BOARD_FILE, Board
 from edge.detectors.board.detector import BoardDetector
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
@@ -47,6 +47,7 @@ Progress = Callable[[str, float], None]
 
 SESSION = "session"
 _DETECTIONS, _STATE = "detections", "videos.json"
+_LARGEST_SQUARE_M = 1.0  # of a board that a hand can move; 30 is likely to be millimetres
 _NOTHING = "nothing"  # what is searched where nothing was recognised
 _LEAST_ROWS = 3  # of a tag's corner in a video
 _SAME_TIME_S = 1e-3  # s: containers round time stamps to milliseconds
@@ -165,6 +166,7 @@ def session_from_videos(
     metadata = tables.pop("metadata", {})
     if target.board is not None:
         metadata |= _body_metadata(target.board, rows)
+        warnings += _oversized(target.board, metadata)
         if "clock" not in metadata and _same_stamps([one for one, _ in found.values()]):
             metadata["in_step"] = True
     heard = {video.camera: sound_energy(video.path) for video in videos if video.camera in found}
@@ -179,12 +181,25 @@ def session_from_videos(
     rig_text = tomli_w.dumps({"metadata": metadata, **tables} if metadata else tables)
     write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: observations_csv(rows)})
     if not rows:
+        refusal = refusal or _unseen(target.board)
         rig = read_rig(session / RIG_FILE)
         if refusal is not None:
             refusal.warnings = tuple(warnings)
         return VideoSession(rig, Observations({}), tuple(warnings), folder.name, priors, tuple(lines), refusal)
     rig, observations = read_folder(session)
     return VideoSession(rig, observations, (*warnings, *observations.warnings), folder.name, priors, tuple(lines))
+
+
+def _oversized(board: Board, metadata: dict[str, Any]) -> list[str]:
+    if metadata.get("units", "m") != "m" or (board.size or 0.0) <= _LARGEST_SQUARE_M:
+        return []
+    remedy = f'give metres, or units = "mm" under [metadata] in {RIG_FILE}'
+    return [f"{BOARD_FILE} says that a square is {board.size:g} m wide: {remedy}"]
+
+
+def _unseen(board: Board | None) -> Refused | None:
+    remedy = f"compare its squares and dictionary in {BOARD_FILE} with the print, or let --detector auto look"
+    return None if board is None else Refused(f"this board is in no frame of the videos: {board.text}; {remedy}")
 
 
 def _video_paths(folder: Path) -> list[Path]:

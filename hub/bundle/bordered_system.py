@@ -214,8 +214,5 @@ def _damped_cholesky(band: Floats, damping: float) -> Floats:
 
 
 def regularisation(diagonal: Floats) -> Floats:
-    """What is added to the diagonal (n,) of A, which may be singular: 1e-12 of each entry.
-
-    Not of the largest: of a path that runs out past a camera's centre it is 1e19, and every other would be held still.
-    """
+    """(n,) 1e-12 of each entry of A's diagonal: of a path past a camera's centre the largest is 1e19 and holds all."""
     return np.asarray(1e-12 * np.where(diagonal > 0.0, diagonal, diagonal.max(initial=1.0)))

@@ -219,14 +219,10 @@ def _mmpose(file: Path) -> Iterator[Keypoint]:
         document = document["instance_info"]
     # frame_id counts from 1 in results of videos and from 0 in others: the list's order counts.
     for number, frame in enumerate(document):
-        people = [
-            (
-                one["keypoints"],
-                one.get("keypoint_scores", [1.0] * len(one["keypoints"])),
-                f"p{one['track_id']}" if "track_id" in one else "",
-            )
-            for one in frame["instances"]
-        ]
+        people = []
+        for one in frame["instances"]:
+            points, name = one["keypoints"], f"p{one['track_id']}" if "track_id" in one else ""
+            people.append((points, one.get("keypoint_scores", [1.0] * len(points)), name))
         yield from _people(people, number, names)
 
 

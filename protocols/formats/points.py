@@ -80,7 +80,7 @@ def detect_format(text: str) -> str | None:
 def nearest_layout(text: str) -> str:
     """Which known table the beginning of a text is nearest to, and what it lacks; "" where it resembles none."""
     lines = text.splitlines() or [""]
-    columns_found, rows = lines[0].split(","), [line.split(",")[0] for line in lines]
+    columns_found, rows = re.split("[,;]", lines[0]), [line.split(",")[0] for line in lines]
     keys = {"".join(found).lower() for found in _KEY.findall(text)}
     header = keys or {cell.strip().lower() for cell in [*columns_found, *rows]}
     found = []
@@ -92,7 +92,7 @@ def nearest_layout(text: str) -> str:
     if share > 0.5:
         return ""
     if not missing:
-        return f"looks like {name}"
+        return f"looks like {name}{', but its columns are parted by semicolons' * (';' in lines[0])}"
     part = "key" if keys else "row" if name == "DeepLabCut's CSV" else "column"
     return f"looks like {name}, but {part} {', '.join(missing).rstrip('.')} is missing"
 

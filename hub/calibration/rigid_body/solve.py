@@ -80,9 +80,7 @@ def _prepare(rig: Rig, observations: Observations, known: FixedCalibration | Non
         seen = gather_views(name, tracks, rig.bodies, labels, origin)
         if seen is None or len(seen.time) < _MIN_VIEWS:
             count = 0 if seen is None else len(seen.time)
-            refused[name] = (
-                "the board is in none of its frames" if not count else f"the board is in {count} frames only"
-            )
+            refused[name] = f"the board is found in {f'only {count}' if count else 'none'} of its frames"
             continue
         if known is not None and name not in known.cameras:
             refused[name] = "not in the known calibration"

@@ -109,6 +109,19 @@ def test_a_wrong_board_toml_is_bad_input_in_one_line(
     assert error.count("\n") == 1
 
 
+def test_a_board_of_another_dictionary_and_millimetres_are_named_as_such(
+    recorded: tuple[Path, BoardWorld], tmp_path: Path, capsys: Capture
+) -> None:
+    for path in recorded[0].glob("*.mp4"):
+        shutil.copy(path, tmp_path)
+    (tmp_path / "board.toml").write_text(BOARD.replace("0.1", "100") + 'dictionary = "7X7_50"\n')
+    command = ["calibrate", str(tmp_path), "--detector", "charuco", "--out", str(tmp_path / "out")]
+    assert run(command) == 3
+    printed = capsys.readouterr()
+    assert "charuco of 8x6 squares, 7X7_50; compare its squares and dictionary" in printed.err
+    assert 'a square is 100 m wide: give metres, or units = "mm"' in printed.out + printed.err
+
+
 def test_a_board_detector_without_board_toml_names_the_file(
     recorded: tuple[Path, BoardWorld], tmp_path: Path, capsys: Capture
 ) -> None:
