@@ -85,7 +85,7 @@ class AppearanceTracker:
         self._missed = 0
         self._unseen_s = 0.0
         self._redetection = Redetection(self._size, self._memory, self._respond)
-        self._ratio = 0.0
+        self._ratio, self._slipped = 0.0, False
         self._expected: Estimate | None = None
         self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
         self._other_std = np.inf
@@ -136,7 +136,7 @@ class AppearanceTracker:
     @property
     def certain(self) -> bool:
         """Whether the last frame shows the target, by clear evidence."""
-        return self._missed == 0 and self._ratio > _CERTAIN
+        return self._missed == 0 and self._ratio > _CERTAIN and not self._slipped
 
     def expect(self, other: Estimate) -> None:
         """Take the place where another tracker has the target in the next image: what it sees there is tested first."""
@@ -213,8 +213,9 @@ class AppearanceTracker:
                 if seen[1] + moves + self._nearer(other, box) > ratio + moved + _SUPPORT:
                     box, (score, ratio), moved = other, seen, moves
         self._ratio = ratio + min(moved, 0.0)  # that something moves is no reason to learn what it looks like
-        if self.certain and (not moving or moved > 0.0):
-            # What stands beside something that moves may have slipped off it: nothing is learnt.
+        # What stands beside something that moves may have slipped off it: nothing is learnt.
+        self._slipped = bool(moving) and moved <= 0.0
+        if self.certain:
             self._parts.confirm(residual, box.centre)
         # What has just covered the target differs from what was seen there, too, but does not look like it.
         # Half of what it may have slipped on to moves, too.
@@ -266,7 +267,7 @@ class AppearanceTracker:
             factor = self._scale.factor(image, box) ** _SCALE_GAIN if self._frame % 2 else 1.0
             sides = np.clip(box.sides * factor, self._first / _MAX_GROWTH, self._first * _MAX_GROWTH)
             box = box.sized(np.clip(sides, 4.0, 0.9 * np.array(self._size)))
-            if self._ratio > _LEARN_ABOVE and self._belief.log_odds > _CERTAIN:
+            if not self._slipped and self._ratio > _LEARN_ABOVE and self._belief.log_odds > _CERTAIN:
                 self._learn(image, box, score)
             if self.certain and self._belief.log_odds > _CERTAIN:
                 self._sure = box, copy(self._motion_filter)
