@@ -184,7 +184,7 @@ def test_what_moves_over_the_stabilised_scene_is_evidence_for_a_target_that_move
 
 def test_what_stands_does_not_move_where_the_scene_is_stabilised_a_pixel_wrong(scene: Image) -> None:
     """Bright lines on a calm road seemed to move with each error of the stabilisation."""
-    calm = cv2.GaussianBlur(scene, (0, 0), 6.0)
+    calm = np.asarray(cv2.GaussianBlur(scene, (0, 0), 6.0), np.uint8)
     cv2.rectangle(calm, (360, 250), (364, 270), (255, 255, 255), -1)
     for off in (-1.0, 1.0):
         _, residual, place = watched(calm, 3.0, off=off)
@@ -198,7 +198,7 @@ def everywhere(ratio: float) -> Residual:
 
 
 def test_that_something_moves_is_no_proof_that_it_is_the_target(scene: Image, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A car that drove beside a truck behind palms gained e cubed in each frame: what it may be taken for moves, too."""
+    """What it may be taken for moves, too: a car beside a truck behind palms had gained e cubed in each frame."""
     evidence = []
     monkeypatch.setattr(Belief, "add", lambda belief, log_ratio, dt: evidence.append(log_ratio))
     place = np.array([120.0, 120.0])
@@ -239,6 +239,26 @@ def test_a_jump_to_what_moves_is_as_likely_as_the_target_can_have_got_there(scen
         tracker._predict(1.0 / FPS)
     assert at_once < -6.0
     assert at_once + 4.0 < tracker._nearer(there, here) < 0.0
+
+
+def test_nothing_is_learnt_where_the_box_stands_beside_something_that_moves(
+    scene: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The filter of a truck had learnt the palms it had slipped off to, and claimed them while the truck was away."""
+    learnt = []
+    for beside in (False, True):
+        ratio = np.full((SIZE[1], SIZE[0]), 1.0, np.float32)
+        ratio[115:125, 155:165] = 20.0 if beside else 1.0
+        residual = Residual(ratio, 1.0, np.zeros(2), 0.1, 0.05)
+        monkeypatch.setattr(MovingParts, "residual", lambda *of, found=residual: found)
+        tracker, place = AppearanceTracker(SIZE, FPS), np.array([120.0, 120.0])
+        tracker.begin(painted(scene, place), 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
+        known = tracker._filter._filter
+        found = [tracker.handle_frame(painted(scene, place), k / FPS) for k in range(1, 6)]
+        assert all(e.state is TrackState.VISIBLE for e in found)
+        learnt.append(tracker._filter._filter is not known)
+        assert tracker.certain is not beside
+    assert learnt == [True, False]
 
 
 def test_for_a_target_that_stands_what_moves_is_no_evidence(scene: Image) -> None:
