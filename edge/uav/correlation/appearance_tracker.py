@@ -34,9 +34,7 @@ _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
-_PLACE_STD = 0.1  # of a place that is measured, in target lengths
 _MOVED = 2.0  # distance within which what moves is looked for, in target lengths
-_STANDS = -0.3  # log likelihood ratio below which a place stands and the target moves
 _WINDOW = 1.2  # half of the region that the filter sees, in target lengths
 _MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
 _UNKNOWN_STEP = 0.1  # std of a step of the scene that could not be measured, over the image's width
@@ -204,21 +202,14 @@ class AppearanceTracker:
             return
         residual = self._parts.residual(self._time, self.box, _MOVED * self.length)
         box, score, ratio = self._measured(image, self.box)
-        moving, moved = residual.peaks(box.extent, 2), residual.log_ratio(box.centre)
-        if moved < _STANDS:
-            # It moved, and what is here stands: what moves beside it may be the target.
-            for place in moving:
-                other, *seen = self._measured(image, box.at(place))
-                moves = residual.log_ratio(other.centre)
-                if seen[1] + moves + self._nearer(other, box) > ratio + moved + _SUPPORT:
-                    box, (score, ratio), moved = other, seen, moves
+        moved = residual.log_ratio(box.centre)
         self._ratio = ratio + min(moved, 0.0)  # that something moves is no reason to learn what it looks like
         # What stands beside something that moves may have slipped off it: nothing is learnt.
-        self._slipped = bool(moving) and moved <= 0.0
+        self._slipped = moved <= 0.0 and bool(residual.peaks(box.extent, 1))
         if self.certain:
             self._parts.confirm(residual, box.centre)
-        # What has just covered the target differs from what was seen there, too, but does not look like it.
-        # Half of what it may have slipped on to moves, too.
+        # What has just covered the target differs from what was seen there, too, but does not look like it; and half of
+        # what it may have slipped on to moves.
         moved = float(np.log(2.0) - np.logaddexp(0.0, -moved))
         ratio += moved if ratio > 0.0 else min(moved, 0.0)
         if self._support is not None and np.hypot(*(box.centre - self._support)) < _SUPPORT_WITHIN * self.length:
@@ -235,13 +226,6 @@ class AppearanceTracker:
             self._observe_background(image, box)
         elif not self.certain and self._frame % _OBSERVE_DOUBTFUL_EVERY == 0:
             self._observe_rivals(image, box)
-
-    def _nearer(self, one: OrientedBox, other: OrientedBox) -> float:
-        """Log ratio of the probabilities that the target has got to one box and to another since it was surely seen."""
-        sure, velocity = self._sure
-        variance = velocity.std**2 + (_PLACE_STD * self.length) ** 2
-        near, far = (np.log1p(0.5 * np.square(b.centre - sure.centre).sum() / variance) for b in (one, other))
-        return float(2.0 * (far - near))
 
     def _measured(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, float, float]:
         """The target about a box: where, its similarity, and the log likelihood ratio by that and by the filter."""

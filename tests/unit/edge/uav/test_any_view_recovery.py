@@ -229,18 +229,6 @@ def test_a_place_that_moves_under_test_looks_like_others_that_move(scene: Image)
     assert stands - unknown < -1.0
 
 
-def test_a_jump_to_what_moves_is_as_likely_as_the_target_can_have_got_there(scene: Image) -> None:
-    """The box of a truck went 28 px to another one within a tenth of a second of clear evidence."""
-    tracker, place = AppearanceTracker(SIZE, FPS), np.array([120.0, 120.0])
-    tracker.begin(painted(scene, place), 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
-    here, there = tracker.box, tracker.box.at(place + [60.0, 0.0])
-    at_once = tracker._nearer(there, here)
-    for _ in range(30):
-        tracker._predict(1.0 / FPS)
-    assert at_once < -6.0
-    assert at_once + 4.0 < tracker._nearer(there, here) < 0.0
-
-
 def test_nothing_is_learnt_where_the_box_stands_beside_something_that_moves(
     scene: Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:
