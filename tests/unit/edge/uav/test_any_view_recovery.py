@@ -229,6 +229,23 @@ def test_a_place_that_moves_under_test_looks_like_others_that_move(scene: Image)
     assert stands - unknown < -1.0
 
 
+@pytest.mark.parametrize(("offset", "goes"), [(15.0, True), (60.0, False)])
+def test_a_box_that_stands_goes_to_what_moves_no_further_than_it_can_have_slipped(
+    scene: Image, monkeypatch: pytest.MonkeyPatch, offset: float, goes: bool
+) -> None:
+    """The box of a truck had gone 28 px to another one."""
+    ratio = np.full((SIZE[1], SIZE[0]), 1.0, np.float32)
+    ratio[115:126, round(115 + offset) : round(126 + offset)] = 20.0
+    residual = Residual(ratio, 1.0, np.zeros(2), 0.9, 0.05)
+    monkeypatch.setattr(MovingParts, "residual", lambda *of: residual)
+    monkeypatch.setattr(AppearanceTracker, "_measured", lambda tracker, image, box: (box, 0.7, 0.0))
+    tracker, place = AppearanceTracker(SIZE, FPS), np.array([120.0, 120.0])
+    tracker.begin(painted(scene, place), 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
+    tracker.handle_frame(painted(scene, place), 1 / FPS)
+    assert (abs(tracker.box.x - place[0] - offset) < 3.0) is goes
+    assert (abs(tracker.box.x - place[0]) < 3.0) is not goes
+
+
 def test_nothing_is_learnt_where_the_box_stands_beside_something_that_moves(
     scene: Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:
