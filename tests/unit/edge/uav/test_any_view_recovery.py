@@ -235,7 +235,7 @@ def test_a_box_that_stands_goes_to_what_moves_no_further_than_it_can_have_slippe
 ) -> None:
     """The box of a truck had gone 28 px to another one."""
     ratio = np.full((SIZE[1], SIZE[0]), 1.0, np.float32)
-    ratio[115:126, round(115 + offset) : round(126 + offset)] = 20.0
+    ratio[120, round(120 + offset)] = 20.0
     residual = Residual(ratio, 1.0, np.zeros(2), 0.9, 0.05)
     monkeypatch.setattr(MovingParts, "residual", lambda *of: residual)
     monkeypatch.setattr(AppearanceTracker, "_measured", lambda tracker, image, box: (box, 0.7, 0.0))
