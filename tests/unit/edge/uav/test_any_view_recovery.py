@@ -238,7 +238,7 @@ def test_a_box_that_stands_goes_to_what_moves_no_further_than_it_can_have_slippe
     ratio[120, round(120 + offset)] = 20.0
     residual = Residual(ratio, 1.0, np.zeros(2), 0.9, 0.05)
     monkeypatch.setattr(MovingParts, "residual", lambda *of: residual)
-    monkeypatch.setattr(AppearanceTracker, "_measured", lambda tracker, image, box: (box, 0.7, 0.0))
+    monkeypatch.setattr(AppearanceTracker, "_measured", lambda of, image, box: (box, 0.7, 4.0 * (box.x > 125.0)))
     tracker, place = AppearanceTracker(SIZE, FPS), np.array([120.0, 120.0])
     tracker.begin(painted(scene, place), 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
     tracker.handle_frame(painted(scene, place), 1 / FPS)
