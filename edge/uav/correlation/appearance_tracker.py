@@ -217,9 +217,7 @@ class AppearanceTracker:
         self._slipped = moved <= 0.0 and bool(moving)
         if self.certain:
             self._parts.confirm(residual, box.centre)
-        # What has just covered the target differs from what was seen there, too, but does not look like it; and half of
-        # what it may have slipped on to moves.
-        moved = float(np.log(2.0) - np.logaddexp(0.0, -moved))
+        # What has just covered the target differs from what was seen there, too, but does not look like it.
         ratio += moved if ratio > 0.0 else min(moved, 0.0)
         if self._support is not None and np.hypot(*(box.centre - self._support)) < _SUPPORT_WITHIN * self.length:
             ratio += _SUPPORT
