@@ -35,6 +35,7 @@ _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at wh
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
 _MOVED = 2.0  # distance within which what moves is looked for, in target lengths
+_SLIP_STD = 0.35  # of a box that has slipped off its target, in target lengths: the two still overlap
 _STANDS = -0.3  # log likelihood ratio below which a place stands and the target moves
 _WINDOW = 1.2  # half of the region that the filter sees, in target lengths
 _MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
@@ -205,12 +206,12 @@ class AppearanceTracker:
         box, score, ratio = self._measured(image, self.box)
         moving, moved = residual.peaks(box.extent, 2), residual.log_ratio(box.centre)
         if moved < _STANDS:
-            # It moved, and what is here stands: it may have slipped off, by no more than about its length.
+            # It moved, and what is here stands: it may have slipped off.
             for place in moving:
                 other, *seen = self._measured(image, box.at(place))
                 moves = residual.log_ratio(other.centre)
                 far = float(np.hypot(*(other.centre - self.box.centre))) / self.length
-                if seen[1] + moves - 2.0 * far**2 > ratio + moved + _SUPPORT:
+                if seen[1] + moves - 0.5 * (far / _SLIP_STD) ** 2 > ratio + moved + _SUPPORT:
                     box, (score, ratio), moved = other, seen, moves
         self._ratio = ratio + min(moved, 0.0)  # that something moves is no reason to learn what it looks like
         # What stands beside something that moves may have slipped off it: nothing is learnt.
