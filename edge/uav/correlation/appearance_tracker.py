@@ -85,7 +85,7 @@ class AppearanceTracker:
         self._missed = 0
         self._unseen_s = 0.0
         self._redetection = Redetection(self._size, self._memory, self._respond)
-        self._ratio, self._slipped = 0.0, False
+        self._ratio, self._learn_above = 0.0, _LEARN_ABOVE
         self._expected: Estimate | None = None
         self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
         self._other_std = np.inf
@@ -136,7 +136,7 @@ class AppearanceTracker:
     @property
     def certain(self) -> bool:
         """Whether the last frame shows the target, by clear evidence."""
-        return self._missed == 0 and self._ratio > _CERTAIN and not self._slipped
+        return self._missed == 0 and self._ratio > _CERTAIN
 
     def expect(self, other: Estimate) -> None:
         """Take the place where another tracker has the target in the next image: what it sees there is tested first."""
@@ -214,9 +214,10 @@ class AppearanceTracker:
                 if seen[1] + moves - 0.5 * (far / _SLIP_STD) ** 2 > ratio + moved + _SUPPORT:
                     box, (score, ratio), moved = other, seen, moves
         self._ratio = ratio + min(moved, 0.0)  # that something moves is no reason to learn what it looks like
-        # What stands beside something that moves may have slipped off it: nothing is learnt.
-        self._slipped = moved <= 0.0 and bool(moving)
-        if self.certain:
+        # What stands beside something that moves may have slipped off it: only clear evidence is learnt from.
+        slipped = bool(moving) and moved <= 0.0
+        self._learn_above = _CERTAIN if slipped else _LEARN_ABOVE
+        if self.certain and not slipped:
             self._parts.confirm(residual, box.centre)
         # What has just covered the target differs from what was seen there, too, but does not look like it.
         ratio += moved if ratio > 0.0 else min(moved, 0.0)
@@ -259,7 +260,7 @@ class AppearanceTracker:
             factor = self._scale.factor(image, box) ** _SCALE_GAIN if self._frame % 2 else 1.0
             sides = np.clip(box.sides * factor, self._first / _MAX_GROWTH, self._first * _MAX_GROWTH)
             box = box.sized(np.clip(sides, 4.0, 0.9 * np.array(self._size)))
-            if not self._slipped and self._ratio > _LEARN_ABOVE and self._belief.log_odds > _CERTAIN:
+            if self._ratio > self._learn_above and self._belief.log_odds > _CERTAIN:
                 self._learn(image, box, score)
             if self.certain and self._belief.log_odds > _CERTAIN:
                 self._sure = box, copy(self._motion_filter)
