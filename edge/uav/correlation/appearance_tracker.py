@@ -82,8 +82,7 @@ class AppearanceTracker:
         self._memory.add(image, self.box)
         self._observe_background(image, self.box)
         self._shape = Outline(image, self.box)
-        self._missed = 0
-        self._unseen_s = 0.0
+        self._missed, self._unseen_s = 0, 0.0
         self._redetection = Redetection(self._size, self._memory, self._respond)
         self._ratio, self._learn_above = 0.0, _LEARN_ABOVE
         self._expected: Estimate | None = None
@@ -215,9 +214,8 @@ class AppearanceTracker:
                     box, (score, ratio), moved = other, seen, moves
         self._ratio = ratio + min(moved, 0.0)  # that something moves is no reason to learn what it looks like
         # What stands beside something that moves may have slipped off it: only clear evidence is learnt from.
-        slipped = bool(moving) and moved <= 0.0
-        self._learn_above = _CERTAIN if slipped else _LEARN_ABOVE
-        if self.certain and not slipped:
+        self._learn_above = _CERTAIN if moving and moved <= 0.0 else _LEARN_ABOVE
+        if self.certain and self._learn_above < _CERTAIN:
             self._parts.confirm(residual, box.centre)
         # What has just covered the target differs from what was seen there, too, but does not look like it.
         ratio += moved if ratio > 0.0 else min(moved, 0.0)

@@ -61,8 +61,8 @@ class Redetection:
 
     def __init__(self, size: tuple[int, int], memory: TemplateMemory, localise: Localise) -> None:
         self._size, self._memory, self._localise = size, memory, localise
-        self._near = 1.0
-        self._inside, self._unnoticed = 0.0, 1.0  # probability that it is in the image, and that it was not seen there
+        # Probabilities that it is near the prediction, that it is in the image, and that it was not seen there.
+        self._near, self._inside, self._unnoticed = 1.0, 0.0, 1.0
         self._tested: list[Candidate] = []
         self._moving = UNKNOWN
 
