@@ -136,7 +136,8 @@ def rendered(seeds: range, ranges: list[float], kinds: list[str]) -> Iterator[Se
             for path in paths:
                 rate, away_s, factor = (of[(seed + k) % len(of)] for of in (_RATES, AWAY_S, ranges))
                 sequence = flight(target, path, 10 * seed + k, rate, away_s, range_factor=factor)
-                if sequence.box[0, 2:].min() >= _LEAST_PX:
+                # One that is behind a house all the time cannot be marked: its first box shows the house.
+                if sequence.box[0, 2:].min() >= _LEAST_PX and sequence.visible[0] >= 0.99:
                     yield sequence
 
 

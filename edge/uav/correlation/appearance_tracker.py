@@ -35,6 +35,7 @@ _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at wh
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
 _MOVED = 2.0  # distance within which what moves is looked for, in target lengths
+_SLIP_STD = 0.35  # of a box that has slipped off its target, in target lengths: the two still overlap
 _STANDS = -0.3  # log likelihood ratio below which a place stands and the target moves
 _WINDOW = 1.2  # half of the region that the filter sees, in target lengths
 _MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
@@ -81,10 +82,9 @@ class AppearanceTracker:
         self._memory.add(image, self.box)
         self._observe_background(image, self.box)
         self._shape = Outline(image, self.box)
-        self._missed = 0
-        self._unseen_s = 0.0
+        self._missed, self._unseen_s = 0, 0.0
         self._redetection = Redetection(self._size, self._memory, self._respond)
-        self._ratio = 0.0
+        self._ratio, self._learn_above = 0.0, _LEARN_ABOVE
         self._expected: Estimate | None = None
         self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
         self._other_std = np.inf
@@ -205,16 +205,17 @@ class AppearanceTracker:
         box, score, ratio = self._measured(image, self.box)
         moving, moved = residual.peaks(box.extent, 2), residual.log_ratio(box.centre)
         if moved < _STANDS:
-            # It moved, and what is here stands: what moves beside it may be the target.
+            # It moved, and what is here stands: it may have slipped off.
             for place in moving:
                 other, *seen = self._measured(image, box.at(place))
                 moves = residual.log_ratio(other.centre)
                 far = float(np.hypot(*(other.centre - self.box.centre))) / self.length
-                if seen[1] + moves - 2.0 * np.log1p(2.0 * far**2) > ratio + moved + _SUPPORT:
+                if seen[1] + moves - 0.5 * (far / _SLIP_STD) ** 2 > ratio + moved + _SUPPORT:
                     box, (score, ratio), moved = other, seen, moves
         self._ratio = ratio + min(moved, 0.0)  # that something moves is no reason to learn what it looks like
-        if self.certain and (not moving or moved > 0.0):
-            # What stands beside something that moves may have slipped off it: nothing is learnt.
+        # What stands beside something that moves may have slipped off it: only clear evidence is learnt from.
+        self._learn_above = _CERTAIN if moving and moved <= 0.0 else _LEARN_ABOVE
+        if self.certain and self._learn_above < _CERTAIN:
             self._parts.confirm(residual, box.centre)
         # What has just covered the target differs from what was seen there, too, but does not look like it.
         ratio += moved if ratio > 0.0 else min(moved, 0.0)
@@ -257,7 +258,7 @@ class AppearanceTracker:
             factor = self._scale.factor(image, box) ** _SCALE_GAIN if self._frame % 2 else 1.0
             sides = np.clip(box.sides * factor, self._first / _MAX_GROWTH, self._first * _MAX_GROWTH)
             box = box.sized(np.clip(sides, 4.0, 0.9 * np.array(self._size)))
-            if self._ratio > _LEARN_ABOVE and self._belief.log_odds > _CERTAIN:
+            if self._ratio > self._learn_above and self._belief.log_odds > _CERTAIN:
                 self._learn(image, box, score)
             if self.certain and self._belief.log_odds > _CERTAIN:
                 self._sure = box, copy(self._motion_filter)

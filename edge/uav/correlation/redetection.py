@@ -61,8 +61,8 @@ class Redetection:
 
     def __init__(self, size: tuple[int, int], memory: TemplateMemory, localise: Localise) -> None:
         self._size, self._memory, self._localise = size, memory, localise
-        self._near = 1.0
-        self._inside, self._unnoticed = 0.0, 1.0  # probability that it is in the image, and that it was not seen there
+        # Probabilities that it is near the prediction, that it is in the image, and that it was not seen there.
+        self._near, self._inside, self._unnoticed = 1.0, 0.0, 1.0
         self._tested: list[Candidate] = []
         self._moving = UNKNOWN
 
@@ -119,7 +119,7 @@ class Redetection:
             return
         priors = [self._log_prior(f.box.centre, expected) for f in new]
         odds = [
-            self._memory.log_ratio(f.score, _CHANGE) + prior + self._moving.log_ratio(f.box.centre)
+            self._memory.log_ratio(f.score, _CHANGE, self._moving.log_ratio(f.box.centre)) + prior
             for f, prior in zip(new, priors, strict=True)
         ]
         order = np.argsort(odds)[::-1]
@@ -163,9 +163,8 @@ class Redetection:
         trials = [box, *(box.sized(f * box.sides) for f in sizes), *(box.turned(angle) for angle in turns)]
         scores = self._memory.scores(image, trials)
         score, box = float(scores.max()), trials[int(scores.argmax())]
-        evidence = self._memory.log_ratio(score, _CHANGE, answer.log_ratio)
-        evidence += self._moving.log_ratio(box.centre)
-        candidate.add(box, evidence, dt)
+        cues = answer.log_ratio + self._moving.log_ratio(box.centre)
+        candidate.add(box, self._memory.log_ratio(score, _CHANGE, cues), dt)
         return candidate.promising and box.share_inside(self._size) > _MIN_INSIDE
 
 
