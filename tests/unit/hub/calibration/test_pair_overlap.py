@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hub.bundle.preprocessing import prepare
-from hub.calibration import pair_network
+from hub.calibration.pairs import pair_network
 from hub.calibration.pairs.pair_network import solve_pairs
 from hub.calibration.pairs.pair_overlap import LARGE_NETWORK, candidate_pairs
 from hub.clocks.clock_graph import connected_components
