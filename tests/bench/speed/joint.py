@@ -29,7 +29,7 @@ from hub.bundle.preprocessing import prepare
 from hub.bundle.problem import CAMERA_PARAMETERS, GIVEN_PARAMETERS, RATE, AdjustmentState, FreeParameters, Problem
 from hub.bundle.residuals import LinearisedResiduals, linearise
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
-from hub.calibration import pipeline
+from hub.calibration import final_adjustment, pipeline
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
@@ -104,8 +104,8 @@ def recorded(session: Path) -> Task:
         calls.append((state, ended))
         return ended
 
-    pipeline_adjust = pipeline.adjust
-    with patch.object(pipeline, "adjust", kept):
+    pipeline_adjust = final_adjustment.adjust
+    with patch.object(final_adjustment, "adjust", kept):
         pipeline.calibrate(rig, read_observations(session / "observations.csv", rig.cameras))
     start, (problem, end, prior) = calls[0]
     first, second = (start.cameras[camera].pose for camera in problem.anchors)
