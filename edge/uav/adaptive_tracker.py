@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, TrackState
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.ground.photometric import contrast_table
 from edge.uav.ground_tracker import GroundTracker
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
@@ -59,6 +61,8 @@ class AdaptiveTracker:
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
         assert self._ground is not None
+        self._contrast = contrast_table(image)
+        image = self._stretched(image)
         first = self._ground.begin(image, time, target)
         seen = self._appearance.begin(image, time, target)
         self._steep = self._ground.view_cosine > _STEEP_COSINE
@@ -74,6 +78,7 @@ class AdaptiveTracker:
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
         """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
         self._frame += 1
+        image = None if image is None else self._stretched(image)
         if self._ground is None:
             return self._without_ground(image, time)
         ground = self._ground.handle_frame(image, time)
@@ -105,6 +110,9 @@ class AdaptiveTracker:
             self._shift = np.array([seen.x - ground.x, seen.y - ground.y])
             self._sides = np.array([seen.width / ground.width, seen.height / ground.height])
         return self._on_ground(self._corrected(ground))
+
+    def _stretched(self, image: Image) -> Image:
+        return image if self._contrast is None else np.asarray(cv2.LUT(image, self._contrast), np.uint8)
 
     def road_outline(self) -> tuple[Floats, Floats | None]:
         """The observed road near the target, see ``GroundTracker``."""

@@ -1,7 +1,7 @@
 """Any target in any view: cars, boats, bicycles and people in oblique video, also while the camera looks away.
 
     python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique]
-        [--first-seed 0] [--ranges 1,2.5,4] [--stabilisation] [--json]
+        [--first-seed 0] [--ranges 1,2.5,4] [--light dusk] [--stabilisation] [--json]
 
 Rendered oblique flights with truth, and where the data folder has them real ones: whole sequences, and windows that pan
 away from the target for 0.5 to 4 s and come back. No lens, no telemetry.
@@ -13,14 +13,14 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from edge.uav import tracker_factory
-from edge.uav.base import Box, Estimate, Tracker, TrackState
+from edge.uav.base import Box, Estimate, Image, Tracker, TrackState
 from edge.uav.image_motion.scene_motion import SceneMotion
 from edge.uav.world.oblique.world import FLIGHTS, TARGETS, ObliqueWorld
 from protocols.geometry.types import Floats
@@ -189,6 +189,14 @@ def stabilised(sequence: Sequence) -> Floats:
     return np.concatenate(found)
 
 
+def in_light(image: Image, light: str, k: int) -> Image:
+    """Image ``k`` at dusk, in haze (both with noise) or in light that flickers by a quarter."""
+    gain, level, noise = {"dusk": (0.25, 0.0, 3.0), "haze": (0.3, 140.0, 2.0), "flicker": (1.0, 0.0, 0.0)}[light]
+    gain *= 1.0 + 0.25 * np.sin(1.3 * k) if light == "flicker" else 1.0
+    grain = noise * np.random.default_rng(k).normal(size=image.shape)
+    return np.asarray(np.clip(gain * image + level + grain, 0, 255), np.uint8)
+
+
 def table(scores: list[Score]) -> str:
     """One line for each kind and model."""
     titles = ("in view", "overlap", "success", "away", "claimed", "held", "ms/frame")
@@ -216,6 +224,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--ranges", default="1", help="of rendered flights, over the usual range: 4 makes a car 12 px")
     parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
+    parser.add_argument("--light", default="", help="change the images: dusk, haze, flicker")
     parser.add_argument("--stabilisation", action="store_true", help="only: how well the real videos are stabilised")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
@@ -235,11 +244,12 @@ def main() -> None:
         sources.append(rendered(seeds, [float(factor) for factor in options.ranges.split(",")], kinds))
     if not kinds or any(not kind.startswith("rendered") for kind in kinds):
         sources.append(real(options.data, not kinds or any("away" in kind for kind in kinds)))
+    light = options.light
     scores = [
-        run(sequence, model)
+        run(replace(s, images=[in_light(i, light, k) for k, i in enumerate(s.images)]) if light else s, model)
         for source in sources
-        for sequence in source
-        if not kinds or sequence.kind in kinds
+        for s in source
+        if not kinds or s.kind in kinds
         for model in models
     ]
     if options.json:

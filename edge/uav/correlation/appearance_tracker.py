@@ -108,6 +108,7 @@ class AppearanceTracker:
             self._miss(dt)
             return self._estimate(time)
         self.motion = self._scene.update(image, self._outline() if self._missed == 0 else None)
+        image = self._scene.photometric.corrected(image)
         place = self.box.centre
         origin = self._predict(dt)
         self._parts.update(image, self._time, self.box, self.motion, place, origin)

@@ -119,7 +119,7 @@ class ScaleFilter:
 
     def factor(self, image: Image, box: OrientedBox) -> float:
         """The factor that brings a box of this size to the learnt scale."""
-        if self._numerator is None:
+        if self._numerator is None or not self._denominator.any():  # nothing was learnt, or a uniform patch
             return 1.0
         spectrum = self._spectrum(image, box)
         regular = _REGULARISATION * float(self._denominator.mean())

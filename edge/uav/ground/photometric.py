@@ -19,13 +19,15 @@ _MAX_TARGET_CHANGE = 0.25  # of the log gain, per measurement
 _MAX_TARGET_LOG_GAIN = 0.7
 _TARGET_DECAY_S = 1.5
 _NEGLIGIBLE_LOG_GAIN = 0.02
+_EXTREMES = (0.02, 0.98)  # quantiles of the levels of the darkest and the lightest places
+_FLAT, _SPAN, _MAX_FACTOR = 96.0, 160.0, 8.0  # distance of these that is too small; that it gets; limit of the factor
 
 
 class PhotometricGain:
-    """Gain (3,) of the channels relative to the first frame."""
+    """Gain (channels,) relative to the first frame."""
 
-    def __init__(self) -> None:
-        self.gain = np.ones(3)
+    def __init__(self, channels: int = 3) -> None:
+        self.gain = np.ones(channels)
         self._previous: Image | None = None
         self._lookup_table: Image | None = None
 
@@ -83,6 +85,19 @@ class TargetGain:
         self.log_gain *= float(np.exp(-dt / _TARGET_DECAY_S))
 
 
+def contrast_table(image: Image) -> Image | None:
+    """Lookup table (1, 256) that gives images a contrast to which noise and compression are small; None: they have it.
+
+    image: the first one, (h, w, 3). At dusk and in haze a few tens of levels lie between its darkest and its lightest.
+    """
+    darkest, lightest = (float(level) for level in np.quantile(image[::4, ::4], _EXTREMES))
+    if lightest - darkest >= _FLAT:
+        return None
+    factor = min(_SPAN / max(lightest - darkest, 1.0), _MAX_FACTOR)
+    levels = (np.arange(256) - darkest) * factor + min(darkest, 255.0 - _SPAN)
+    return np.asarray(np.clip(np.rint(levels), 0, 255), np.uint8)[None]
+
+
 def _lookup_table(gain: Floats) -> Image:
     levels = np.arange(256)[:, None] / gain
     return np.asarray(np.clip(np.rint(levels), 0, 255), np.uint8)[None]
@@ -93,7 +108,7 @@ def _divided(image: Image, gain: Floats) -> Image:
 
 
 def _bilinear(image: Image, points: Floats) -> Floats:
-    """Colours (n, 3) at image points (n, 2), bilinearly interpolated."""
+    """Colours (n, channels) at image points (n, 2), bilinearly interpolated."""
     at = points.astype(np.float32)
     found = cv2.remap(image.astype(np.float32), at[:, :1], at[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found, dtype=np.float64).reshape(-1, 3)
+    return np.asarray(found, dtype=np.float64).reshape(len(points), -1)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from edge.uav.base import Image
 from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.ground.photometric import PhotometricGain
 from protocols.geometry.types import Bools, Floats
 
 Gray = npt.NDArray[np.uint8]
@@ -31,6 +32,7 @@ _PARTS, _VOTE_PX = (4, 2), 2  # parts that are searched after a fast pan; agreem
 _PARALLAX_PX = 6.0  # largest correction [px of the working image]
 _PARALLAX_PRIOR = (1.0, 2.0, 2.0)  # tracks that say there is none, and that it does not grow
 _REACH = 0.3  # of the parallax correction, over the image's width
+_BRIGHTER = 0.05  # log change of the exposure from which the flow is computed again without it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +83,10 @@ def middle(values: Floats) -> float:
     return float(np.partition(values, half)[half])
 
 
+def _times(gray: Gray, factor: float) -> Gray:
+    return np.asarray(cv2.convertScaleAbs(gray, alpha=factor), np.uint8)
+
+
 class SceneMotion:
     """Estimates the motion from image to image. size: (width, height) [px]."""
 
@@ -88,6 +94,7 @@ class SceneMotion:
         self._scale = max(1.0, size[0] / _WORKING_WIDTH)
         self._size = (round(size[0] / self._scale), round(size[1] / self._scale))
         self._gray: Gray | None = None
+        self.photometric = PhotometricGain(1)
         self._last = np.eye(2, 3)
         self.reach = _REACH * size[0]
         """Distance over which parallax is taken to be alike [px]."""
@@ -98,16 +105,30 @@ class SceneMotion:
         gray = np.asarray(small, np.uint8)
         previous, self._gray = self._gray, gray
         if previous is None:
+            self.photometric.update(gray, np.zeros((0, 2)), np.zeros((0, 2)))
             return STILL
         corners = self._corners(previous, excluded)
-        motion = STILL
+        motion, gain = STILL, self.photometric.gain
         if len(corners) >= _MIN_TRACKS:
             motion = self._fit(*self._flow(previous, gray, corners, self._last))
             if not motion.trusted:
-                again = self._fit(*self._flow(previous, gray, corners, self._coarse_shift(previous, gray)))
-                motion = again if again.share > motion.share else motion
+                like = _times(gray, cv2.mean(previous)[0] / max(cv2.mean(gray)[0], 1.0))
+                coarse = self._coarse_shift(previous, gray)
+                motion = max(motion, self._fit(*self._flow(previous, like, corners, coarse)), key=lambda one: one.share)
+        self.photometric.update(gray, *self._working_tracks(motion))
+        change = float((gain / self.photometric.gain)[0])
+        if motion.trusted and abs(np.log(change)) > _BRIGHTER:
+            tracks = self._flow(previous, _times(gray, change), corners, self._to_working(motion.matrix))
+            motion = max(motion, self._fit(*tracks), key=lambda one: one.share)
         self._last = self._to_working(motion.matrix) if motion.trusted else np.eye(2, 3)
         return motion
+
+    def _working_tracks(self, motion: Motion) -> tuple[Floats, Floats]:
+        """Old and new positions (n, 2) of the static tracks in the working images; none where they are not trusted."""
+        if not motion.trusted:
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        moved = motion.points @ motion.matrix[:, :2].T + motion.matrix[:, 2] + motion.residuals
+        return (motion.points + 0.5) / self._scale - 0.5, (moved + 0.5) / self._scale - 0.5
 
     def _corners(self, gray: Gray, excluded: Floats | None) -> npt.NDArray[np.float32]:
         mask = np.full(gray.shape, 255, np.uint8)

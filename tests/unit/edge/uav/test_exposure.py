@@ -1,0 +1,62 @@
+"""Exposure: light that changes from image to image, dusk and haze."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.uav.base import Box
+from edge.uav.ground.photometric import contrast_table
+from edge.uav.image_motion.scene_motion import SceneMotion
+from edge.uav.tracker_factory import make_tracker
+from edge.uav.world.oblique.world import ObliqueWorld
+from tests.bench.uav_any_view import in_light
+
+
+def test_the_scenes_motion_is_measured_while_the_exposure_changes() -> None:
+    rng = np.random.default_rng(3)
+    ground = cv2.GaussianBlur(rng.normal(120, 160, (300, 500, 3)).astype(np.float32), (0, 0), 2.5)
+    scene = np.asarray(np.clip(ground, 0, 255), np.uint8)
+    motion = SceneMotion((320, 240))
+    for k in range(12):
+        found = motion.update(
+            in_light(np.ascontiguousarray(scene[20:260, 20 + 3 * k : 340 + 3 * k]), "flicker", k), None
+        )
+        if k:
+            assert found.trusted
+            assert found.matrix == pytest.approx(np.array([[1.0, 0.0, -3.0], [0.0, 1.0, 0.0]]), abs=0.25)
+    assert motion.photometric.gain[0] == pytest.approx(1.0 + 0.25 * np.sin(1.3 * 11), rel=0.08)
+
+
+@pytest.mark.parametrize("light", ["flicker", "dusk", "haze"])
+def test_a_target_is_followed_in_any_light(light: str) -> None:
+    world = ObliqueWorld("bicycle", "follow", seed=2, frames=45, fps=15.0)
+    tracker = make_tracker("ground", world.size, fps=world.fps)
+    near = 0
+    for k in range(45):
+        image, truth = world.rendered(k)
+        image, box = in_light(image, light, k), truth.box
+        e = tracker.begin(image, 0.0, box) if k == 0 else tracker.handle_frame(image, k / world.fps)
+        near += bool(np.hypot(e.x - box.x - 0.5 * box.width, e.y - box.y - 0.5 * box.height) < max(box.width, 12.0))
+    assert near >= 42
+
+
+@pytest.mark.parametrize("low", [0, 20, 170])
+def test_contrast_is_never_reduced_and_levels_keep_their_order(low: int) -> None:
+    image = np.full((40, 40, 3), low, np.uint8)
+    image[:, 20:] = low + 30
+    table = contrast_table(image)
+    assert table is not None
+    levels = table.ravel().astype(int)
+    assert (np.diff(levels) >= 0).all()
+    assert levels[low + 30] - levels[low] >= 100
+    assert contrast_table(cv2.merge([np.tile(np.arange(256, dtype=np.uint8), (40, 1))] * 3)) is None
+    assert contrast_table(np.zeros((40, 40, 3), np.uint8)) is not None  # nothing to see, and no division by zero
+
+
+def test_a_black_first_image_is_no_error() -> None:
+    tracker = make_tracker("ground", (320, 240))
+    black = np.zeros((240, 320, 3), np.uint8)
+    tracker.begin(black, 0.0, Box(100.0, 100.0, 30.0, 20.0))
+    assert np.isfinite(tracker.handle_frame(black, 0.1).std)
