@@ -12,7 +12,7 @@ import numpy as np
 from hub.bundle.bordered_system import third_difference_band, third_difference_gradient, third_differences
 from hub.bundle.problem import AdjustmentState, Problem, Trajectory
 from hub.trajectory.splines import SUPPORT
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Ints
 
 _MIN_SCATTER_SHARE = 1e-3 / 3.0
 """Smallest share of a path's scatter in any direction: a planar path has none across its plane."""
@@ -66,13 +66,20 @@ def estimate_smoothness(problem: Problem, state: AdjustmentState, weak: bool = F
                 index, _, inside = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[rows.use]))[:3]
                 seen[rows.camera, index[inside]] = True
         seen_by_two = seen.sum(axis=0)[path.basis.interval_starts()] >= 2
-        chosen = differences[seen_by_two] if seen_by_two.sum() >= 4 else differences
+        inner = _inner(seen_by_two, path.basis.interval_starts())
+        chosen = differences[inner] if inner.sum() >= 4 else differences
         variance = float(np.mean(chosen**2)) if len(chosen) else 1.0
         scale = float(np.median(np.ptp(path.control, axis=0))) or 1.0
         variance = max(variance, (1e-6 * scale) ** 2)
         weights.append(np.full(count, (1e-3 if weak else 1.0) / variance))
         scatters.append(None if weak else _path_scatter(path, seen_by_two, weights[-1]))
     return SmoothnessPrior(tuple(weights), tuple(scatters))
+
+
+def _inner(seen: Bools, starts: Ints) -> Bools:
+    """The intervals (m,) that are seen and whose neighbours on both sides are."""
+    both = seen[1:] & seen[:-1] & (np.diff(starts) == 1)
+    return np.r_[False, both] & np.r_[both, False]
 
 
 def _path_scatter(path: Trajectory, seen_by_two: Bools, weight: Floats) -> PathScatter | None:
@@ -86,7 +93,7 @@ def _path_scatter(path: Trajectory, seen_by_two: Bools, weight: Floats) -> PathS
     if seen_by_two.sum() < 4:
         return None
     control_mask = np.zeros(path.basis.size, dtype=np.bool_)
-    control_mask[(path.basis.interval_starts()[seen_by_two, None] + np.arange(SUPPORT)).ravel()] = True
+    control_mask[(path.basis.interval_starts()[seen_by_two, None] + np.arange(1, SUPPORT - 1)).ravel()] = True
     scatter = _scatter(path.control[control_mask], 0.0)
     floor = _MIN_SCATTER_SHARE * float(np.trace(scatter))
     if not floor > 0.0:
