@@ -1,9 +1,11 @@
 """Cameras calibrated by the keypoints of several walking people, whom every camera numbers in its own, changing way.
 
-    python -m tests.bench.several_people [--seeds 1 2] [--people 3] [--fps 25 30 25] [--seconds 30] [--no-lenses]
+    python -m tests.bench.several_people [--seeds 1 2] [--people 3] [--fps 25 30 25] [--seconds 30]
+        [--noise 2] [--no-lenses]
 
-Keypoints have 2 px of noise and gaps, and a camera numbers people anew every 5 s. Printed: the share of the keypoints
-whose name is one person in all cameras, and the errors of the calibration from them after one similarity.
+Keypoints have noise and gaps, and a camera numbers people anew every 5 s. Printed: the share of the keypoints whose
+name is one person in all cameras, the errors of the calibration from them after one similarity, those of lags and clock
+rates over their stds, and readouts and clock steps, of which there are none.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from hub.calibration.pipeline import calibrate
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.pose import fit_similarity
+from protocols.geometry.types import Floats
+from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 from tests.support.walking_people import JOINTS, PeopleWorld, people_world
@@ -30,11 +34,13 @@ def main() -> int:
     parser.add_argument("--people", type=int, default=3)
     parser.add_argument("--fps", type=float, nargs="+", default=[25.0, 30.0, 25.0])
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--noise", type=float, default=2.0)
     parser.add_argument("--no-lenses", action="store_true")
     options = parser.parse_args()
+    scores, false = [np.zeros((0, 2))], 0
     for seed in options.seeds:
         world = people_world(seed, options.people, tuple(options.fps))
-        given = world.observations(options.seconds, seed=seed)
+        given = world.observations(options.seconds, noise=options.noise, seed=seed)
         began = time.process_time()
         rig, seen, _ = associate_people(world.rig(not options.no_lenses), given)
         spent = time.process_time() - began
@@ -44,10 +50,30 @@ def main() -> int:
             f"seed {seed}: {100 * right / total:.1f} % named rightly, {100 * len(seen) / len(given):.0f} % of the rows,"
         )
         try:
-            print(f"  {scored(world, options.seconds, rig, seen)}; association {spent:.0f} s of CPU", flush=True)
+            text, found = scored(world, options.seconds, rig, seen)
         except Refused as refused:
             print(f"  refused: {refused.reason}", flush=True)
+            continue
+        scores.append(clock_scores(world, found))
+        invented = [name for name, one in found.cameras.items() if one.readout_std or one.clock_steps]
+        false += bool(invented)
+        print(f"  {text}; association {spent:.0f} s of CPU; a readout or step: {', '.join(invented) or 'none'}")
+        print(f"  z of lags and rates: {scores[-1].round(1).tolist()}", flush=True)
+    lag, rate = np.sqrt(np.mean(np.concatenate(scores) ** 2, axis=0))
+    print(f"rms of z: lags {lag:.2f}, rates {rate:.2f}; {false} of {len(scores) - 1} with a readout or step")
     return 0
+
+
+def clock_scores(world: PeopleWorld, found: Calibration) -> Floats:
+    """Errors (n, 2) of the lag at `lag_time` and of the rate, over their stds, of the cameras but the reference."""
+    base, out = world.cameras[found.reference], list[tuple[float, float]]()
+    for name, one in found.cameras.items():
+        if name != found.reference:
+            real, clock = world.cameras[name], one.time_map
+            true = (real.rate * one.lag_time + real.offset - base.offset) / base.rate
+            lag = clock.clock_rate * one.lag_time + clock.time_offset - true
+            out.append((lag / one.lag_std, (clock.clock_rate - real.rate / base.rate) / one.clock_rate_std))
+    return np.array(out).reshape(-1, 2)
 
 
 def named(world: PeopleWorld, observations: Observations) -> dict[str, Counter[int]]:
@@ -65,10 +91,11 @@ def named(world: PeopleWorld, observations: Observations) -> dict[str, Counter[i
     return found
 
 
-def scored(world: PeopleWorld, seconds: float, rig: Rig, seen: Observations) -> str:
-    """The errors of the calibration."""
+def scored(world: PeopleWorld, seconds: float, rig: Rig, seen: Observations) -> tuple[str, Calibration]:
+    """The errors of the calibration, and itself."""
     began = time.process_time()
-    found = calibrate(rig, seen, thorough=True).cameras
+    calibration = calibrate(rig, seen, thorough=True)
+    found = calibration.cameras
     spent = time.process_time() - began
     places, true = (np.array([one[name].pose.position for name in found]) for one in (found, world.cameras))
     fit = fit_similarity(places, true)
@@ -85,7 +112,7 @@ def scored(world: PeopleWorld, seconds: float, rig: Rig, seen: Observations) -> 
     return (
         f"{len(found)} of {len(world.cameras)} cameras, {worst:.1f} cm, {max(turns):.2f}°, "
         f"lags {1e3 * np.ptp(off):.1f} ms, {spent:.0f} s of CPU"
-    )
+    ), calibration
 
 
 if __name__ == "__main__":

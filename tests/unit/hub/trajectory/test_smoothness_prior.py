@@ -95,6 +95,25 @@ def test_the_normalisation_has_no_gradient_where_only_one_camera_sees() -> None:
     assert not pull[-20:].any()
 
 
+@pytest.mark.parametrize("end", [2, -3])
+def test_an_end_that_no_row_holds_is_pulled_back(end: int) -> None:
+    """As a part of the path's scatter it lowered its own cost, and its third difference was the path's strength: of
+    walking people, ends flew by a metre, and clocks followed by 1000 ppm. end: a control point of one interval."""
+    problem, state = two_cameras(6)
+    path = state.trajectories[0]
+    strength = estimate_smoothness(problem, state).weights[0][0]
+    flown = path.control.copy()
+    flown[end] += [3.0, 0.0, 0.0]
+    moved = replace(state, trajectories=(replace(path, control=flown),))
+    prior = estimate_smoothness(problem, moved)
+    assert prior.weights[0][0] > 0.5 * strength
+    near, far = path.control.copy(), path.control.copy()
+    near[end] += [1.0, 0.0, 0.0]
+    far[end] += [3.0, 0.0, 0.0]
+    at = value(path, prior, path.control)
+    assert value(path, prior, far) - at > 5.0 * (value(path, prior, near) - at)  # as its square, not less and less
+
+
 def test_paths_seen_by_two_cameras_keep_their_size() -> None:
     """Mean of log(estimated size / true size): with a shrinking prior it is 4.4 stds of the mean below 0."""
     found = []
