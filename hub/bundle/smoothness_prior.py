@@ -39,8 +39,8 @@ class PathScatter:
     """Extent of a path in all directions, by which the strength of its prior is normalised.
 
     held: (m,) knot intervals whose control points are held by rows of two cameras (`_held`). control_mask: (size,)
-    control points of these. floor: added to the diagonal of their scatter matrix S. scale: of the metric ``scale * S⁻¹``, in which the prior has the
-    strength that was estimated.
+    control points of these. floor: added to the diagonal of their scatter matrix S. scale: of the metric
+    ``scale * S⁻¹``, in which the prior has the strength that was estimated.
     """
 
     held: Bools
@@ -81,8 +81,11 @@ def _held(seen: Bools, starts: Ints) -> Bools:
     Where a path ends, hardly any row holds the last control point. As a part of the scatter it lowered its own cost as
     it flew off; its third difference was then the path's strength, and the clocks followed the ends by 1000 ppm.
     """
-    both = seen[1:] & seen[:-1] & (np.diff(starts) == 1)
-    return np.r_[False, both] & np.r_[both, False]
+    held, joined = seen.copy(), np.diff(starts) == 1
+    held[1:] &= seen[:-1] & joined
+    held[:-1] &= seen[1:] & joined
+    held[:1] = held[-1:] = False
+    return held
 
 
 def _path_scatter(path: Trajectory, held: Bools, weight: Floats) -> PathScatter | None:
