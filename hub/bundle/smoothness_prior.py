@@ -71,7 +71,7 @@ def estimate_smoothness(problem: Problem, state: AdjustmentState, weak: bool = F
         scale = float(np.median(np.ptp(path.control, axis=0))) or 1.0
         variance = max(variance, (1e-6 * scale) ** 2)
         weights.append(np.full(count, (1e-3 if weak else 1.0) / variance))
-        scatters.append(None if weak else _path_scatter(path, held, weights[-1]))
+        scatters.append(None if weak else _path_scatter(path, held))
     return SmoothnessPrior(tuple(weights), tuple(scatters))
 
 
@@ -88,7 +88,7 @@ def _held(seen: Bools, starts: Ints) -> Bools:
     return held
 
 
-def _path_scatter(path: Trajectory, held: Bools, weight: Floats) -> PathScatter | None:
+def _path_scatter(path: Trajectory, held: Bools) -> PathScatter | None:
     """The scatter that normalises the prior's strength; None for a path of which two cameras see hardly anything.
 
     A smaller or flatter path has smaller third differences: a prior of fixed strength prefers both, and cameras follow
@@ -100,14 +100,12 @@ def _path_scatter(path: Trajectory, held: Bools, weight: Floats) -> PathScatter 
         return None
     control_mask = np.zeros(path.basis.size, dtype=np.bool_)
     control_mask[(path.basis.interval_starts()[held, None] + np.arange(SUPPORT)).ravel()] = True
-    scatter = _scatter(path.control[control_mask], 0.0)
-    floor = _MIN_SCATTER_SHARE * float(np.trace(scatter))
+    floor = _MIN_SCATTER_SHARE * float(np.trace(_scatter(path.control[control_mask], 0.0)))
     if not floor > 0.0:
         return None
     differences = third_differences(path.basis, path.control)[held]
     inverse = np.linalg.inv(_scatter(path.control[control_mask], floor))
-    plain = float((weight[held, None] * differences**2).sum())
-    metric = float((weight[held, None] * (differences @ inverse) * differences).sum())
+    plain, metric = float((differences**2).sum()), float(((differences @ inverse) * differences).sum())
     return PathScatter(held, control_mask, floor, plain / metric) if metric > 0.0 else None
 
 

@@ -37,7 +37,7 @@ def main() -> int:
     parser.add_argument("--noise", type=float, default=2.0)
     parser.add_argument("--no-lenses", action="store_true")
     options = parser.parse_args()
-    scores, false = [np.zeros((0, 2))], 0
+    errors, invented = [np.zeros((0, 4))], 0
     for seed in options.seeds:
         world = people_world(seed, options.people, tuple(options.fps))
         given = world.observations(options.seconds, noise=options.noise, seed=seed)
@@ -50,30 +50,30 @@ def main() -> int:
             f"seed {seed}: {100 * right / total:.1f} % named rightly, {100 * len(seen) / len(given):.0f} % of the rows,"
         )
         try:
-            text, found = scored(world, options.seconds, rig, seen)
+            text, found = scored(world, rig, seen)
         except Refused as refused:
             print(f"  refused: {refused.reason}", flush=True)
             continue
-        scores.append(clock_scores(world, found))
-        invented = [name for name, one in found.cameras.items() if one.readout_std or one.clock_steps]
-        false += bool(invented)
-        print(f"  {text}; association {spent:.0f} s of CPU; a readout or step: {', '.join(invented) or 'none'}")
-        print(f"  z of lags and rates: {scores[-1].round(1).tolist()}", flush=True)
-    lag, rate = np.sqrt(np.mean(np.concatenate(scores) ** 2, axis=0))
-    print(f"rms of z: lags {lag:.2f}, rates {rate:.2f}; {false} of {len(scores) - 1} with a readout or step")
+        errors.append(clock_errors(world, found))
+        names = [name for name, one in found.cameras.items() if one.readout_std or one.clock_steps]
+        invented += bool(names)
+        print(f"  {text}; association {spent:.0f} s of CPU; a readout or step: {', '.join(names) or 'none'}")
+        print(f"  lag ± std [s], rate ± std: {errors[-1].tolist()}", flush=True)
+    lag, lag_std, rate, rate_std = np.concatenate(errors).T
+    z = [float(np.sqrt(np.mean(error**2))) for error in (lag / lag_std, rate / rate_std)]
+    print(f"rms of z: lags {z[0]:.2f}, rates {z[1]:.2f}; {invented} of {len(errors) - 1} with a readout or step")
     return 0
 
 
-def clock_scores(world: PeopleWorld, found: Calibration) -> Floats:
-    """Errors (n, 2) of the lag at `lag_time` and of the rate, over their stds, of the cameras but the reference."""
-    base, out = world.cameras[found.reference], list[tuple[float, float]]()
+def clock_errors(world: PeopleWorld, found: Calibration) -> Floats:
+    """Errors of lag [s] and rate, each with its std, (n, 4), of the cameras but the reference."""
+    base, out = world.cameras[found.reference], list[tuple[float, ...]]()
     for name, one in found.cameras.items():
         if name != found.reference:
-            real, clock = world.cameras[name], one.time_map
-            true = (real.rate * one.lag_time + real.offset - base.offset) / base.rate
-            lag = clock.clock_rate * one.lag_time + clock.time_offset - true
-            out.append((lag / one.lag_std, (clock.clock_rate - real.rate / base.rate) / one.clock_rate_std))
-    return np.array(out).reshape(-1, 2)
+            rate, offset = np.array([world.cameras[name].rate, world.cameras[name].offset - base.offset]) / base.rate
+            lag = one.lag - (rate - 1.0) * one.lag_time - offset
+            out.append((lag, one.lag_std, one.time_map.clock_rate - rate, one.clock_rate_std))
+    return np.array(out).reshape(-1, 4)
 
 
 def named(world: PeopleWorld, observations: Observations) -> dict[str, Counter[int]]:
@@ -91,28 +91,21 @@ def named(world: PeopleWorld, observations: Observations) -> dict[str, Counter[i
     return found
 
 
-def scored(world: PeopleWorld, seconds: float, rig: Rig, seen: Observations) -> tuple[str, Calibration]:
+def scored(world: PeopleWorld, rig: Rig, seen: Observations) -> tuple[str, Calibration]:
     """The errors of the calibration, and itself."""
     began = time.process_time()
     calibration = calibrate(rig, seen, thorough=True)
-    found = calibration.cameras
-    spent = time.process_time() - began
+    spent, found = time.process_time() - began, calibration.cameras
     places, true = (np.array([one[name].pose.position for name in found]) for one in (found, world.cameras))
     fit = fit_similarity(places, true)
     turns = [
         np.degrees(so3.angle_between(fit.pose(one.pose).rotation, world.cameras[name].pose.rotation))
         for name, one in found.items()
     ]
-    middle, off = 0.5 * seconds, []
-    for name, one in found.items():
-        real = world.cameras[name]
-        clock = one.time_map
-        off.append(clock.clock_rate * middle + clock.time_offset - real.rate * middle - real.offset)
     worst = 100 * float(np.linalg.norm(fit.points(places) - true, axis=1).max())
-    return (
-        f"{len(found)} of {len(world.cameras)} cameras, {worst:.1f} cm, {max(turns):.2f}°, "
-        f"lags {1e3 * np.ptp(off):.1f} ms, {spent:.0f} s of CPU"
-    ), calibration
+    lags = 1e3 * float(np.abs(clock_errors(world, calibration)[:, 0]).max())
+    text = f"{len(found)} of {len(world.cameras)} cameras, {worst:.1f} cm, {max(turns):.2f}°, lags {lags:.1f} ms"
+    return f"{text}, {spent:.0f} s of CPU", calibration
 
 
 if __name__ == "__main__":

@@ -102,16 +102,13 @@ def test_an_end_that_no_row_holds_is_pulled_back(end: int) -> None:
     problem, state = two_cameras(6)
     path = state.trajectories[0]
     strength = estimate_smoothness(problem, state).weights[0][0]
-    flown = path.control.copy()
-    flown[end] += [3.0, 0.0, 0.0]
-    moved = replace(state, trajectories=(replace(path, control=flown),))
+    off = np.zeros_like(path.control)
+    off[end, 0] = 1.0
+    moved = replace(state, trajectories=(replace(path, control=path.control + 3.0 * off),))
     prior = estimate_smoothness(problem, moved)
     assert prior.weights[0][0] > 0.5 * strength
-    near, far = path.control.copy(), path.control.copy()
-    near[end] += [1.0, 0.0, 0.0]
-    far[end] += [3.0, 0.0, 0.0]
-    at = value(path, prior, path.control)
-    assert value(path, prior, far) - at > 5.0 * (value(path, prior, near) - at)  # as its square, not less and less
+    at, near, far = (value(path, prior, path.control + metres * off) for metres in (0.0, 1.0, 3.0))
+    assert far - at > 5.0 * (near - at)  # as its square, not less and less
 
 
 def test_paths_seen_by_two_cameras_keep_their_size() -> None:
