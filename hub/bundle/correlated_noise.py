@@ -138,6 +138,3 @@ def prefers_nominal_lenses(problem: Problem, best: GlsSolution) -> bool:
     posterior = best.free[np.ix_(lens_rows, lens_rows)]
     quadratic = float(offset @ np.linalg.solve(posterior, offset))
     return bool(quadratic + np.linalg.slogdet(posterior)[1] < 2.0 * np.log(std).sum())
-
-
-__all__ = ["lens_tolerance", "prefers_nominal_lenses", "refit_with_correlated_noise"]

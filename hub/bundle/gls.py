@@ -358,6 +358,3 @@ def _solve_banded(normal: SparseEntries, order: Ints, right: Floats) -> Floats:
     ordered = np.empty_like(right, order="F")
     ordered[order] = right
     return np.asarray(cho_solve_banded((factor, False), ordered, overwrite_b=True, check_finite=False)[order])
-
-
-__all__ = ["GlsSolution", "SparseEntries", "gls_cost", "is_tractable", "solve_gls"]

@@ -12,7 +12,7 @@ import numpy as np
 from hub.bundle.bordered_system import third_difference_band, third_difference_gradient, third_differences
 from hub.bundle.problem import AdjustmentState, Problem, Trajectory
 from hub.trajectory.splines import SUPPORT
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Ints
 
 _MIN_SCATTER_SHARE = 1e-3 / 3.0
 """Smallest share of a path's scatter in any direction: a planar path has none across its plane."""
@@ -38,12 +38,12 @@ class SmoothnessPrior:
 class PathScatter:
     """Extent of a path in all directions, by which the strength of its prior is normalised.
 
-    seen_by_two: (m,) knot intervals that two cameras see. control_mask: (size,) control points of these. floor: added
-    to the diagonal of their scatter matrix S. scale: of the metric ``scale * S⁻¹``, in which the prior has the
-    strength that was estimated.
+    held: (m,) knot intervals whose control points are held by rows of two cameras (`_held`). control_mask: (size,)
+    control points of these. floor: added to the diagonal of their scatter matrix S. scale: of the metric
+    ``scale * S⁻¹``, in which the prior has the strength that was estimated.
     """
 
-    seen_by_two: Bools
+    held: Bools
     control_mask: Bools
     floor: float
     scale: float
@@ -65,17 +65,30 @@ def estimate_smoothness(problem: Problem, state: AdjustmentState, weak: bool = F
             if rows.label == label:
                 index, _, inside = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[rows.use]))[:3]
                 seen[rows.camera, index[inside]] = True
-        seen_by_two = seen.sum(axis=0)[path.basis.interval_starts()] >= 2
-        chosen = differences[seen_by_two] if seen_by_two.sum() >= 4 else differences
+        held = _held(seen.sum(axis=0)[path.basis.interval_starts()] >= 2, path.basis.interval_starts())
+        chosen = differences[held] if held.sum() >= 4 else differences
         variance = float(np.mean(chosen**2)) if len(chosen) else 1.0
         scale = float(np.median(np.ptp(path.control, axis=0))) or 1.0
         variance = max(variance, (1e-6 * scale) ** 2)
         weights.append(np.full(count, (1e-3 if weak else 1.0) / variance))
-        scatters.append(None if weak else _path_scatter(path, seen_by_two, weights[-1]))
+        scatters.append(None if weak else _path_scatter(path, held))
     return SmoothnessPrior(tuple(weights), tuple(scatters))
 
 
-def _path_scatter(path: Trajectory, seen_by_two: Bools, weight: Floats) -> PathScatter | None:
+def _held(seen: Bools, starts: Ints) -> Bools:
+    """The intervals (m,) of ``seen``, by two cameras, whose neighbours on both sides are seen too.
+
+    Where a path ends, hardly any row holds the last control point. As a part of the scatter it lowered its own cost as
+    it flew off; its third difference was then the path's strength, and the clocks followed the ends by 1000 ppm.
+    """
+    held, joined = seen.copy(), np.diff(starts) == 1
+    held[1:] &= seen[:-1] & joined
+    held[:-1] &= seen[1:] & joined
+    held[:1] = held[-1:] = False
+    return held
+
+
+def _path_scatter(path: Trajectory, held: Bools) -> PathScatter | None:
     """The scatter that normalises the prior's strength; None for a path of which two cameras see hardly anything.
 
     A smaller or flatter path has smaller third differences: a prior of fixed strength prefers both, and cameras follow
@@ -83,19 +96,17 @@ def _path_scatter(path: Trajectory, seen_by_two: Bools, weight: Floats) -> PathS
     cameras see the path its third differences d are measured in the metric of the scatter S of its control points:
     sum w dᵀ S⁻¹ d is invariant under affine maps of the path.
     """
-    if seen_by_two.sum() < 4:
+    if held.sum() < 4:
         return None
     control_mask = np.zeros(path.basis.size, dtype=np.bool_)
-    control_mask[(path.basis.interval_starts()[seen_by_two, None] + np.arange(SUPPORT)).ravel()] = True
-    scatter = _scatter(path.control[control_mask], 0.0)
-    floor = _MIN_SCATTER_SHARE * float(np.trace(scatter))
+    control_mask[(path.basis.interval_starts()[held, None] + np.arange(SUPPORT)).ravel()] = True
+    floor = _MIN_SCATTER_SHARE * float(np.trace(_scatter(path.control[control_mask], 0.0)))
     if not floor > 0.0:
         return None
-    differences = third_differences(path.basis, path.control)[seen_by_two]
+    differences = third_differences(path.basis, path.control)[held]
     inverse = np.linalg.inv(_scatter(path.control[control_mask], floor))
-    plain = float((weight[seen_by_two, None] * differences**2).sum())
-    metric = float((weight[seen_by_two, None] * (differences @ inverse) * differences).sum())
-    return PathScatter(seen_by_two, control_mask, floor, plain / metric) if metric > 0.0 else None
+    plain, metric = float((differences**2).sum()), float(((differences @ inverse) * differences).sum())
+    return PathScatter(held, control_mask, floor, plain / metric) if metric > 0.0 else None
 
 
 def _centred(control: Floats) -> Floats:
@@ -121,7 +132,7 @@ def smoothness_terms(path: Trajectory, weight: Floats, scatter: PathScatter | No
     if scatter is None:
         return third_difference_band(path.basis, weight, np.eye(3)), gradient, value
     control = path.control[scatter.control_mask]
-    inside, outside = np.where(scatter.seen_by_two, weight, 0.0), np.where(scatter.seen_by_two, 0.0, weight)
+    inside, outside = np.where(scatter.held, weight, 0.0), np.where(scatter.held, 0.0, weight)
     moment = (inside[:, None] * differences).T @ differences
     gradient.reshape(-1, 3)[scatter.control_mask] -= (
         scatter.scale / len(control) * _centred(control) @ inverse @ moment @ inverse
@@ -141,5 +152,5 @@ def _half_gradient(
     inverse: Floats = np.asarray(
         np.linalg.inv(_scatter(path.control[scatter.control_mask], scatter.floor)), dtype=np.float64
     )
-    half_gradients = np.where(scatter.seen_by_two[:, None], differences @ (scatter.scale * inverse), differences)
+    half_gradients = np.where(scatter.held[:, None], differences @ (scatter.scale * inverse), differences)
     return weight[:, None] * half_gradients, inverse

@@ -207,6 +207,3 @@ def _cauchy_weight(residual: Floats, width: float) -> Floats:
 def recentred(found: RefinementResult, centre: float, samples: Samples) -> RefinementResult:
     """``found`` of samples centred at ``centre`` [s], with its intercept at the centre of ``samples``."""
     return replace(found, intercept=found.intercept + found.inverse_rate * (samples.centre - centre))
-
-
-__all__ = ["LagUncertainty", "estimate_lag_uncertainty", "recentred"]

@@ -565,6 +565,3 @@ def evaluate_alignment(
     """Quality figures of an alignment ``t_a = t_b + offset`` [s] that another method estimated."""
     s = settings or PairSettings()
     return Samples([a], [b], offset, s, s.refinement_samples).evaluate(0.0, 1.0, offset, pose)
-
-
-__all__ = ["evaluate_alignment", "solve_pair"]

@@ -1,9 +1,11 @@
 """Cameras calibrated by the keypoints of several walking people, whom every camera numbers in its own, changing way.
 
-    python -m tests.bench.several_people [--seeds 1 2] [--people 3] [--fps 25 30 25] [--seconds 30] [--no-lenses]
+    python -m tests.bench.several_people [--seeds 1 2] [--people 3] [--fps 25 30 25] [--seconds 30]
+        [--noise 2] [--no-lenses]
 
-Keypoints have 2 px of noise and gaps, and a camera numbers people anew every 5 s. Printed: the share of the keypoints
-whose name is one person in all cameras, and the errors of the calibration from them after one similarity.
+Keypoints have noise and gaps, and a camera numbers people anew every 5 s. Printed: the share of the keypoints whose
+name is one person in all cameras, the errors of the calibration from them after one similarity, those of lags and clock
+rates over their stds, and readouts and clock steps, of which there are none.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from hub.calibration.pipeline import calibrate
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.pose import fit_similarity
+from protocols.geometry.types import Floats
+from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 from tests.support.walking_people import JOINTS, PeopleWorld, people_world
@@ -30,11 +34,13 @@ def main() -> int:
     parser.add_argument("--people", type=int, default=3)
     parser.add_argument("--fps", type=float, nargs="+", default=[25.0, 30.0, 25.0])
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--noise", type=float, default=2.0)
     parser.add_argument("--no-lenses", action="store_true")
     options = parser.parse_args()
+    errors, invented = [np.zeros((0, 4))], 0
     for seed in options.seeds:
         world = people_world(seed, options.people, tuple(options.fps))
-        given = world.observations(options.seconds, seed=seed)
+        given = world.observations(options.seconds, noise=options.noise, seed=seed)
         began = time.process_time()
         rig, seen, _ = associate_people(world.rig(not options.no_lenses), given)
         spent = time.process_time() - began
@@ -44,10 +50,30 @@ def main() -> int:
             f"seed {seed}: {100 * right / total:.1f} % named rightly, {100 * len(seen) / len(given):.0f} % of the rows,"
         )
         try:
-            print(f"  {scored(world, options.seconds, rig, seen)}; association {spent:.0f} s of CPU", flush=True)
+            text, found = scored(world, rig, seen)
         except Refused as refused:
             print(f"  refused: {refused.reason}", flush=True)
+            continue
+        errors.append(clock_errors(world, found))
+        names = [name for name, one in found.cameras.items() if one.readout_std or one.clock_steps]
+        invented += bool(names)
+        print(f"  {text}; association {spent:.0f} s of CPU; a readout or step: {', '.join(names) or 'none'}")
+        print(f"  lag ± std [s], rate ± std: {errors[-1].tolist()}", flush=True)
+    lag, lag_std, rate, rate_std = np.concatenate(errors).T
+    z = [float(np.sqrt(np.mean(error**2))) for error in (lag / lag_std, rate / rate_std)]
+    print(f"rms of z: lags {z[0]:.2f}, rates {z[1]:.2f}; {invented} of {len(errors) - 1} with a readout or step")
     return 0
+
+
+def clock_errors(world: PeopleWorld, found: Calibration) -> Floats:
+    """Errors of lag [s] and rate, each with its std, (n, 4), of the cameras but the reference."""
+    base, out = world.cameras[found.reference], list[tuple[float, ...]]()
+    for name, one in found.cameras.items():
+        if name != found.reference:
+            rate, offset = np.array([world.cameras[name].rate, world.cameras[name].offset - base.offset]) / base.rate
+            lag = one.lag - (rate - 1.0) * one.lag_time - offset
+            out.append((lag, one.lag_std, one.time_map.clock_rate - rate, one.clock_rate_std))
+    return np.array(out).reshape(-1, 4)
 
 
 def named(world: PeopleWorld, observations: Observations) -> dict[str, Counter[int]]:
@@ -65,27 +91,21 @@ def named(world: PeopleWorld, observations: Observations) -> dict[str, Counter[i
     return found
 
 
-def scored(world: PeopleWorld, seconds: float, rig: Rig, seen: Observations) -> str:
-    """The errors of the calibration."""
+def scored(world: PeopleWorld, rig: Rig, seen: Observations) -> tuple[str, Calibration]:
+    """The errors of the calibration, and itself."""
     began = time.process_time()
-    found = calibrate(rig, seen, thorough=True).cameras
-    spent = time.process_time() - began
+    calibration = calibrate(rig, seen, thorough=True)
+    spent, found = time.process_time() - began, calibration.cameras
     places, true = (np.array([one[name].pose.position for name in found]) for one in (found, world.cameras))
     fit = fit_similarity(places, true)
     turns = [
         np.degrees(so3.angle_between(fit.pose(one.pose).rotation, world.cameras[name].pose.rotation))
         for name, one in found.items()
     ]
-    middle, off = 0.5 * seconds, []
-    for name, one in found.items():
-        real = world.cameras[name]
-        clock = one.time_map
-        off.append(clock.clock_rate * middle + clock.time_offset - real.rate * middle - real.offset)
     worst = 100 * float(np.linalg.norm(fit.points(places) - true, axis=1).max())
-    return (
-        f"{len(found)} of {len(world.cameras)} cameras, {worst:.1f} cm, {max(turns):.2f}°, "
-        f"lags {1e3 * np.ptp(off):.1f} ms, {spent:.0f} s of CPU"
-    )
+    lags = 1e3 * float(np.abs(clock_errors(world, calibration)[:, 0]).max())
+    text = f"{len(found)} of {len(world.cameras)} cameras, {worst:.1f} cm, {max(turns):.2f}°, lags {lags:.1f} ms"
+    return f"{text}, {spent:.0f} s of CPU", calibration
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def test_the_cost_is_invariant_under_the_paths_scale() -> None:
     centre = path.control.mean(axis=0)
     at, larger = (value(path, prior, centre + factor * (path.control - centre)) for factor in (1.0, 1.0001))
     assert at > 10.0
-    assert abs(larger - at) < 0.1 * 2e-4 * at  # not exactly: outside the rows' span there is no normalisation
+    assert abs(larger - at) < 0.15 * 2e-4 * at  # not exactly: where rows hardly hold the path it is not normalised
     plain = SmoothnessPrior(prior.weights, ())
     gradient = smoothness_terms(path, plain.weights[0], None)[1]
     assert gradient @ (path.control - centre).ravel() == pytest.approx(at, rel=1e-6)
@@ -70,7 +70,7 @@ def test_the_cost_is_invariant_under_affine_maps_of_the_path(seed: int) -> None:
     centre = path.control.mean(axis=0)
     size = prior.scatters[0]
     assert size is not None
-    seen = SmoothnessPrior((np.where(size.seen_by_two, prior.weights[0], 0.0),), prior.scatters)
+    seen = SmoothnessPrior((np.where(size.held, prior.weights[0], 0.0),), prior.scatters)
     picture = np.eye(3) + 0.3 * np.random.default_rng(seed).normal(size=(3, 3))
     at, other = (value(path, seen, centre + (path.control - centre) @ one) for one in (np.eye(3), picture))
     assert other == pytest.approx(at, rel=0.02)  # except for the floor of the scatter
@@ -93,6 +93,22 @@ def test_the_normalisation_has_no_gradient_where_only_one_camera_sees() -> None:
     pull = np.subtract(*terms).reshape(-1, 3)
     assert np.abs(pull[4:20]).max(axis=1).min() > 0.0
     assert not pull[-20:].any()
+
+
+@pytest.mark.parametrize("end", [2, -3])
+def test_an_end_that_no_row_holds_is_pulled_back(end: int) -> None:
+    """As a part of the path's scatter it lowered its own cost, and its third difference was the path's strength: of
+    walking people, ends flew by a metre, and clocks followed by 1000 ppm. end: a control point of one interval."""
+    problem, state = two_cameras(6)
+    path = state.trajectories[0]
+    strength = estimate_smoothness(problem, state).weights[0][0]
+    off = np.zeros_like(path.control)
+    off[end, 0] = 1.0
+    moved = replace(state, trajectories=(replace(path, control=path.control + 3.0 * off),))
+    prior = estimate_smoothness(problem, moved)
+    assert prior.weights[0][0] > 0.5 * strength
+    at, near, far = (value(path, prior, path.control + metres * off) for metres in (0.0, 1.0, 3.0))
+    assert far - at > 5.0 * (near - at)  # as its square, not less and less
 
 
 def test_paths_seen_by_two_cameras_keep_their_size() -> None:
