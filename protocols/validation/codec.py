@@ -7,7 +7,7 @@ that the caller counts. The limits are in ``protocols.validation.rules``.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -26,6 +26,7 @@ __all__ = [
     "Rejected",
     "RejectionReason",
     "admit",
+    "admit_all",
     "decode",
     "encode",
     "message_class",
@@ -47,6 +48,9 @@ UAV_MESSAGES = (
 """The messages of a UAV agent; all have its name in the field ``agent``."""
 _CLASSES: Mapping[str, type[Message]] = {topic.message: getattr(pb, topic.message) for topic in TOPICS}
 _LAYOUTS = Layouts()
+_SENDERS: dict[tuple[str, str, str], Address] = {}
+"""Key, camera and boot of observations that were valid, a bounded number of them."""
+_MAX_SENDERS = 8192
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +62,7 @@ class Address:
     agent: str
 
 
-@lru_cache(maxsize=8192)
+@lru_cache(maxsize=_MAX_SENDERS)
 def parse_key(key: str) -> Address | None:
     """The address in a key such as ``syncline/local/camera/cam0/observation``; None for other keys."""
     for topic, pattern in _KEYS:
@@ -93,8 +97,8 @@ def encode(message: Message) -> bytes:
     return payload
 
 
-def decode(topic: Topic, payload: bytes) -> Message:
-    """Parse and validate one payload of ``topic``; raises Rejected."""
+def decode(topic: Topic, payload: bytes, matched: bool = False) -> Message:
+    """Parse and validate one payload of ``topic``; raises Rejected. matched: a layout has validated it."""
     if len(payload) > MAX_PAYLOAD:
         raise Rejected(RejectionReason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}")
     try:
@@ -103,7 +107,7 @@ def decode(topic: Topic, payload: bytes) -> Message:
         raise Rejected(RejectionReason.GARBLED, str(error)) from None
     try:
         if isinstance(message, pb.Observation):
-            _check_observation(message, payload)
+            _check_observation(message, payload, matched)
         else:
             check(message)
     except Rejected as error:
@@ -112,17 +116,17 @@ def decode(topic: Topic, payload: bytes) -> Message:
     return message
 
 
-def _check_observation(message: pb.Observation, payload: bytes) -> None:
+def _check_observation(message: pb.Observation, payload: bytes, matched: bool) -> None:
     """``check``, by the layout of earlier observations where one matches."""
-    if _LAYOUTS.match(payload):
+    if matched or _LAYOUTS.match(payload):
         check_names(message.camera, message.boot_id)
     else:
         check(message)
         _LAYOUTS.learn(payload)
 
 
-def admit(key: str, payload: bytes) -> tuple[Address, Message]:
-    """Parse and validate what arrived under ``key``; raises Rejected.
+def admit(key: str, payload: bytes, matched: bool = False) -> tuple[Address, Message]:
+    """Parse and validate what arrived under ``key``; raises Rejected. matched: a layout has validated it.
 
     A message whose sender differs from the agent in its key is rejected: otherwise an agent that may publish
     only below its own key could publish in another's name.
@@ -130,8 +134,32 @@ def admit(key: str, payload: bytes) -> tuple[Address, Message]:
     address = parse_key(key)
     if address is None:
         raise Rejected(RejectionReason.UNKNOWN_KEY, key[:200])
-    message = decode(address.topic, payload)
+    message = decode(address.topic, payload, matched)
     claimed = message.camera if isinstance(message, pb.Observation) else sender(message)
     if claimed is not None and claimed != address.agent:
         raise Rejected(RejectionReason.WRONG_SENDER, f"{claimed!r} under the key of {address.agent!r}")
     return address, message
+
+
+def admit_all(arrived: Sequence[tuple[str, bytes]]) -> Iterator[tuple[Address, Message] | Rejected]:
+    """``admit`` of each, or why it is rejected: what many observations have in common is looked at once."""
+    matched = _LAYOUTS.match_all([payload for _, payload in arrived])
+    for (key, payload), valid in zip(arrived, matched, strict=True):
+        try:
+            if valid:
+                observation = pb.Observation.FromString(payload)
+                address = _SENDERS.get((key, observation.camera, observation.boot_id))
+                if address is not None:
+                    yield address, observation
+                    continue
+            address, message = admit(key, payload, valid)
+        except DecodeError as error:
+            yield Rejected(RejectionReason.GARBLED, str(error))
+        except Rejected as error:
+            yield error
+        else:
+            if isinstance(message, pb.Observation):
+                if len(_SENDERS) >= _MAX_SENDERS:
+                    _SENDERS.clear()
+                _SENDERS[key, message.camera, message.boot_id] = address
+            yield address, message
