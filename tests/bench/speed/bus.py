@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from hub.live.agent import freeze_garbage_collector
 from protocols.bus.router.zenoh_router import free_endpoint
 from protocols.bus.security.sender_identity import SenderCheckedBus
 from protocols.bus.settings import BusConfig
@@ -39,6 +40,7 @@ def _hear_ours(endpoint: str, count: int) -> dict[str, object]:
     with open_bus("local", BusConfig(listen=(endpoint,)), timeout_s=10.0) as bus:
         guarded = SenderCheckedBus(bus, time.monotonic)
         subscription = guarded.subscribe(OBSERVATION)
+        freeze_garbage_collector()  # as the hub does
         print("ready", flush=True)
         first = last = 0
         while len(latencies) < count:
