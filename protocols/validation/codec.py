@@ -7,7 +7,7 @@ that the caller counts. The limits are in ``protocols.validation.rules``.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -26,7 +26,6 @@ __all__ = [
     "Rejected",
     "RejectionReason",
     "admit",
-    "admit_all",
     "decode",
     "encode",
     "message_class",
@@ -48,9 +47,7 @@ UAV_MESSAGES = (
 """The messages of a UAV agent; all have its name in the field ``agent``."""
 _CLASSES: Mapping[str, type[Message]] = {topic.message: getattr(pb, topic.message) for topic in TOPICS}
 _LAYOUTS = Layouts()
-_SENDERS: dict[tuple[str, str, str], Address] = {}
-"""Key, camera and boot of observations that were valid, a bounded number of them."""
-_MAX_SENDERS = 8192
+_check_names = lru_cache(maxsize=8192)(check_names)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +59,7 @@ class Address:
     agent: str
 
 
-@lru_cache(maxsize=_MAX_SENDERS)
+@lru_cache(maxsize=8192)
 def parse_key(key: str) -> Address | None:
     """The address in a key such as ``syncline/local/camera/cam0/observation``; None for other keys."""
     for topic, pattern in _KEYS:
@@ -97,8 +94,8 @@ def encode(message: Message) -> bytes:
     return payload
 
 
-def decode(topic: Topic, payload: bytes, matched: bool = False) -> Message:
-    """Parse and validate one payload of ``topic``; raises Rejected. matched: a layout has validated it."""
+def decode(topic: Topic, payload: bytes) -> Message:
+    """Parse and validate one payload of ``topic``; raises Rejected."""
     if len(payload) > MAX_PAYLOAD:
         raise Rejected(RejectionReason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD}")
     try:
@@ -107,7 +104,7 @@ def decode(topic: Topic, payload: bytes, matched: bool = False) -> Message:
         raise Rejected(RejectionReason.GARBLED, str(error)) from None
     try:
         if isinstance(message, pb.Observation):
-            _check_observation(message, payload, matched)
+            _check_observation(message, payload)
         else:
             check(message)
     except Rejected as error:
@@ -116,17 +113,17 @@ def decode(topic: Topic, payload: bytes, matched: bool = False) -> Message:
     return message
 
 
-def _check_observation(message: pb.Observation, payload: bytes, matched: bool) -> None:
+def _check_observation(message: pb.Observation, payload: bytes) -> None:
     """``check``, by the layout of earlier observations where one matches."""
-    if matched or _LAYOUTS.match(payload):
-        check_names(message.camera, message.boot_id)
+    if _LAYOUTS.match(payload):
+        _check_names(message.camera, message.boot_id)
     else:
         check(message)
         _LAYOUTS.learn(payload)
 
 
-def admit(key: str, payload: bytes, matched: bool = False) -> tuple[Address, Message]:
-    """Parse and validate what arrived under ``key``; raises Rejected. matched: a layout has validated it.
+def admit(key: str, payload: bytes) -> tuple[Address, Message]:
+    """Parse and validate what arrived under ``key``; raises Rejected.
 
     A message whose sender differs from the agent in its key is rejected: otherwise an agent that may publish
     only below its own key could publish in another's name.
@@ -134,32 +131,8 @@ def admit(key: str, payload: bytes, matched: bool = False) -> tuple[Address, Mes
     address = parse_key(key)
     if address is None:
         raise Rejected(RejectionReason.UNKNOWN_KEY, key[:200])
-    message = decode(address.topic, payload, matched)
+    message = decode(address.topic, payload)
     claimed = message.camera if isinstance(message, pb.Observation) else sender(message)
     if claimed is not None and claimed != address.agent:
         raise Rejected(RejectionReason.WRONG_SENDER, f"{claimed!r} under the key of {address.agent!r}")
     return address, message
-
-
-def admit_all(arrived: Sequence[tuple[str, bytes]]) -> Iterator[tuple[Address, Message] | Rejected]:
-    """``admit`` of each, or why it is rejected: what many observations have in common is looked at once."""
-    matched = _LAYOUTS.match_all([payload for _, payload in arrived])
-    for (key, payload), valid in zip(arrived, matched, strict=True):
-        try:
-            if valid:
-                observation = pb.Observation.FromString(payload)
-                address = _SENDERS.get((key, observation.camera, observation.boot_id))
-                if address is not None:
-                    yield address, observation
-                    continue
-            address, message = admit(key, payload, valid)
-        except DecodeError as error:
-            yield Rejected(RejectionReason.GARBLED, str(error))
-        except Rejected as error:
-            yield error
-        else:
-            if isinstance(message, pb.Observation):
-                if len(_SENDERS) >= _MAX_SENDERS:
-                    _SENDERS.clear()
-                _SENDERS[key, message.camera, message.boot_id] = address
-            yield address, message

@@ -10,9 +10,6 @@ one little-endian integer N:
   integers of their bits (IEEE 754), so a number in bounds plus the bound's distance to 2⁶³ leaves bit 63 clear; NaN
   and infinities are larger than every bound. A letter from the space on plus 0x60 sets bit 7.
 
-Many messages of one size are compared as rows of 64-bit words, with numpy. A number may lie across two words: the sum's
-carry goes from one to the next, and no further, since no field of a sum overflows.
-
 Only covariances are computed with. What no layout matches is checked field by field: it is not refused for that, and
 refusals with their reasons come from ``rules`` alone.
 """
@@ -20,22 +17,16 @@ refusals with their reasons come from ``rules`` alone.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias
-
-import numpy as np
+from collections.abc import Callable
+from typing import NamedTuple
 
 from protocols.core.ranges import MAX_PIXEL
-
-_Words: TypeAlias = np.ndarray[Any, np.dtype[np.uint64]]
 
 _MAX_SIZE = 4096
 """Bytes of a message that is worth a layout: thirty people with all their fields."""
 _MAX_LAYOUTS, _MAX_OF_SIZE = 512, 4
 _FIRST_LAYOUTS, _HITS_PER_LAYOUT = 64, 8
 """A layout costs about three checks: where shapes do not come again, no more of them are made."""
-_LEAST_ROWS = 16
-"""Messages of one size from which on numpy's calls, 25 us together, cost less than one integer each."""
 _VARIABLE, _LITERAL, _TEXT = 0, 1, 2  # kinds of a layout's parts
 _VARINTS = {0x08: 0, 0x20: 7, 0x28: 7, 0x30: 9, 0x38: 6}
 """Of an observation: most bytes of each varint, so that its bound holds (2⁵³, 2⁶², an hour); 0: as in the model."""
@@ -67,10 +58,6 @@ class Layout(NamedTuple):
     text: int
     ones: int
     covariances: Callable[[bytes], tuple[float, ...]] | None
-    starts: tuple[int, ...]
-    """First byte of each covariance."""
-    words: tuple[_Words, ...]
-    """structure, skeleton, values, slack, high, wanted, text and ones, the last word padded with zeros."""
 
 
 class _Builder:
@@ -95,10 +82,7 @@ class _Builder:
             gaps = [b - a - 24 for a, b in zip([-24, *self.covariances], self.covariances, strict=False)]
             unpack = struct.Struct("<" + "".join(f"{gap}x3d" for gap in gaps)).unpack_from
         skeleton = int.from_bytes(self.payload, "little") & structure
-        numbers = (structure, skeleton, values, slack, high, ones << 7, text, ones)
-        size = len(self.payload) + -len(self.payload) % 8
-        words = tuple(np.frombuffer(number.to_bytes(size, "little"), "<u8") for number in numbers)
-        return Layout(*numbers, unpack, tuple(self.covariances), words)
+        return Layout(structure, skeleton, values, slack, high, ones << 7, text, ones, unpack)
 
     def _fields(self, at: int, end: int, field: Callable[[int, int], int]) -> None:
         """Process the fields of one message; each but the detections at most once."""
@@ -203,7 +187,7 @@ class Layouts:
         if layouts is None:
             return False
         whole = int.from_bytes(payload, "little")
-        for structure, skeleton, values, slack, high, wanted, text, ones, covariances, _, _ in layouts:
+        for structure, skeleton, values, slack, high, wanted, text, ones, covariances in layouts:
             if whole & structure == skeleton:
                 if ((whole & values) + slack) & high != wanted or (text and ((whole & text) + ones) & wanted):
                     return False
@@ -212,38 +196,6 @@ class Layouts:
                 self._hits += 1
                 return True
         return False
-
-    def match_all(self, payloads: Sequence[bytes]) -> list[bool]:
-        """``match`` of each."""
-        found = [False] * len(payloads)
-        of_size: dict[int, list[int]] = {}
-        for place, size in enumerate(map(len, payloads)):
-            if size in self._of_size:
-                of_size.setdefault(size, []).append(place)
-        for size, places in of_size.items():
-            if len(places) < _LEAST_ROWS:
-                for place in places:
-                    found[place] = self.match(payloads[place])
-                continue
-            padding = bytes(-size % 8)
-            rows = np.frombuffer(padding.join([*(payloads[place] for place in places), b""]), np.uint8)
-            for place, good in zip(places, self._match_rows(rows.reshape(len(places), -1), size), strict=True):
-                found[place] = good
-        return found
-
-    def _match_rows(self, rows: np.ndarray[Any, np.dtype[np.uint8]], size: int) -> list[bool]:
-        """``match`` of messages of one size, a row each."""
-        good, left = np.zeros(len(rows), bool), np.arange(len(rows))
-        for layout in self._of_size[size]:
-            structure, skeleton, *rules = layout.words
-            words = rows[left].view("<u8")
-            same = ((words & structure) == skeleton).all(1)
-            good[left[same]] = _in_bounds(words[same], layout.starts, rules)
-            left = left[~same]
-            if not len(left):
-                break
-        self._hits += int(good.sum())
-        return [bool(one) for one in good]
 
     def learn(self, payload: bytes) -> None:
         """Make a layout of an observation that has passed every rule."""
@@ -260,22 +212,6 @@ class Layouts:
         if len(kept) < _MAX_OF_SIZE:
             self._kept += 1
         self._of_size[len(payload)] = [layout, *kept[: _MAX_OF_SIZE - 1]]
-
-
-def _in_bounds(words: _Words, starts: Sequence[int], rules: Sequence[_Words]) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Whether each row's numbers and letters are in bounds. starts: of covariances; rules: a layout's words."""
-    values, slack, high, wanted, text, ones = rules
-    sums = (words & values) + slack
-    sums[:, 1:] += (sums < slack)[:, :-1]
-    good: np.ndarray[Any, np.dtype[np.bool_]] = ((sums & high) == wanted).all(1)
-    if text.any():
-        good &= ~(((words & text) + ones) & wanted).any(1)
-    if starts:
-        octets = words.view(np.uint8)
-        triples = np.stack([octets[:, start : start + 24] for start in starts], axis=1).view("<f8")
-        with np.errstate(all="ignore"):  # of rows that are out of bounds anyway
-            good &= (triples[:, :, 1] ** 2 <= triples[:, :, 0] * triples[:, :, 2]).all(1)
-    return good
 
 
 def _are_covariances(values: tuple[float, ...]) -> bool:

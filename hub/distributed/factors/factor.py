@@ -195,10 +195,8 @@ class Edge:
 
     def add(self, row: tuple[float, ...]) -> None:
         """Add a row of 10: x, y, log size in this camera and in the neighbour; then the four weights."""
-        if self.reverse:
-            x, y, size, other_x, other_y, other_size, weight, size_weight, other_weight, other_size_weight = row
-            row = (other_x, other_y, other_size, x, y, size, other_weight, other_size_weight, weight, size_weight)
-        self._pending.append(row)
+        x, y, s, u, v, w, a, b, c, d = row
+        self._pending.append((u, v, w, x, y, s, c, d, a, b) if self.reverse else row)
 
     def neighbour_from_own(self, pose: RelativeTransform) -> RelativeTransform:
         """The neighbour relative to this camera, from a pose in the factor's parametrisation."""
