@@ -22,11 +22,11 @@ import numpy as np
 from edge.uav import tracker_factory
 from edge.uav.base import Box, Estimate, Image, Tracker, TrackState
 from edge.uav.image_motion.scene_motion import SceneMotion
-from edge.uav.world.oblique.world import FLIGHTS, TARGETS, ObliqueWorld
 from protocols.geometry.types import Floats
 from tests.bench import uav_rivals
 from tests.bench.real_rigs import DEFAULT_DATA
 from tests.bench.uav_sequences import AWAY_S, Sequence, aerial, oblique, pan_away
+from tests.support.oblique.world import FLIGHTS, TARGETS, ObliqueWorld
 
 MODELS = ("ground", *uav_rivals.NAMES)
 NEAR_PX, HELD_FRAMES = 20.0, 20

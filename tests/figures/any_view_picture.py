@@ -15,7 +15,7 @@ from deploy.offline.track import TrackedFrame
 from deploy.offline.track_overlay import draw
 from edge.uav import tracker_factory
 from edge.uav.base import Image
-from edge.uav.world.oblique.world import ObliqueWorld
+from tests.support.oblique.world import ObliqueWorld
 
 SCENES = (("car", "follow", 1, 24), ("bicycle", "orbit", 2, 24), ("boat", "zoom", 4, 24), ("person", "away", 3, 38))
 """Target, flight, seed, and the frame that is shown: the person is out of the image then."""

@@ -195,7 +195,8 @@ class Edge:
 
     def add(self, row: tuple[float, ...]) -> None:
         """Add a row of 10: x, y, log size in this camera and in the neighbour; then the four weights."""
-        self._pending.append((*row[3:6], *row[0:3], *row[8:10], *row[6:8]) if self.reverse else row)
+        x, y, s, u, v, w, a, b, c, d = row
+        self._pending.append((u, v, w, x, y, s, c, d, a, b) if self.reverse else row)
 
     def neighbour_from_own(self, pose: RelativeTransform) -> RelativeTransform:
         """The neighbour relative to this camera, from a pose in the factor's parametrisation."""

@@ -13,8 +13,8 @@ from edge.uav.correlation.oriented_box import OrientedBox, crop
 from edge.uav.correlation.scale import BoxFlow
 from edge.uav.image_motion.scene_motion import STILL, SceneMotion
 from edge.uav.tracker_factory import make_tracker
-from edge.uav.world.oblique.world import ObliqueWorld
 from protocols.geometry.camera import Intrinsics
+from tests.support.oblique.world import ObliqueWorld
 
 SIZE = (320, 240)
 TARGET = (34, 22)

@@ -16,8 +16,8 @@ from edge.uav.correlation.filter import CorrelationFilter, Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.correlation.velocity import VelocityFilter
-from edge.uav.world.oblique.world import ObliqueWorld
 from tests.bench import uav_any_view, uav_rivals
+from tests.support.oblique.world import ObliqueWorld
 from tests.unit.edge.uav.test_any_view import FPS, SIZE, TARGET, paint, scene
 
 __all__ = ["scene"]

@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from edge.uav.base import Box
 from edge.uav.world.noise import smoothed_noise, value_noise
-from edge.uav.world.oblique import bodies
-from edge.uav.world.oblique.bodies import Body, View
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
+from tests.support.oblique import bodies
+from tests.support.oblique.bodies import Body, View
 
 Image = npt.NDArray[np.uint8]
 
