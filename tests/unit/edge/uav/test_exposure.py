@@ -10,8 +10,8 @@ from edge.uav.base import Box
 from edge.uav.ground.photometric import contrast_table
 from edge.uav.image_motion.scene_motion import SceneMotion
 from edge.uav.tracker_factory import make_tracker
-from edge.uav.world.oblique.world import ObliqueWorld
 from tests.bench.uav_any_view import in_light
+from tests.support.oblique.world import ObliqueWorld
 
 
 def test_the_scenes_motion_is_measured_while_the_exposure_changes() -> None:
