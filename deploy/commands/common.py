@@ -27,6 +27,7 @@ Scheduler = Annotated[
         "line; --out is a folder. Called again, it does what is left."
     ),
 ]
+NumberList = Annotated[str, Parameter(allow_leading_hyphen=True)]  # "-3,9" is a value
 Role = Literal["camera", "uav", "hub", "recorder", "router"]
 Names = Annotated[list[str] | None, Parameter(negative="", help="Only these agents, by id or ROLE-ID.")]
 

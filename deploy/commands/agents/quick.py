@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deploy.commands.common import Flag, Json, answer, check_range, check_seed, parse_box
+from deploy.commands.common import Flag, Json, NumberList, answer, check_range, check_seed, parse_box
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def quick(
     source: tuple[Path, ...] = (),
     simulated: Flag = False,
     out: Path = Path("quick-out"),
-    target: str | None = None,
+    target: NumberList | None = None,
     rig: Path | None = None,
     field_of_view: float = 65.0,
     seconds: float = 300.0,

@@ -9,6 +9,7 @@ from typing import Literal
 from deploy.commands.common import (
     Flag,
     Json,
+    NumberList,
     Scheduler,
     UnusedSeed,
     answer,
@@ -43,7 +44,7 @@ def detect(
     threshold: int | None = None,
     dictionary: str | None = None,
     teach: Flag = False,
-    target: str | None = None,
+    target: NumberList | None = None,
     start: int = 0,
     marker: Path | None = None,
     colour: str | None = None,

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from deploy.commands.common import Json, Scheduler, answer, check_range, closing_lines
+from deploy.commands.common import Json, NumberList, Scheduler, answer, check_range, closing_lines
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import check_folder, write_together
@@ -25,7 +25,7 @@ def follow(
     detector: str | None = None,
     fps: float | None = None,
     truth: Path | None = None,
-    area: str | None = None,
+    area: NumberList | None = None,
     crops: Path | None = None,
     json: Json = False,
     scheduler: Scheduler = None,

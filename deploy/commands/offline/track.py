@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from deploy.commands.common import Flag, Json, Scheduler, answer, check_rate, check_seed, closing_lines
+from deploy.commands.common import Flag, Json, NumberList, Scheduler, answer, check_rate, check_seed, closing_lines
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError
 from protocols.core.files import check_folder, write_together
@@ -23,7 +23,7 @@ def track(
     video: Path,
     /,
     *,
-    target: str,
+    target: NumberList,
     out: Path,
     start: int = 0,
     rig: Path | None = None,

@@ -80,6 +80,7 @@ def test_every_command_shows_an_example_that_its_own_options_allow(name: str) ->
     for example in examples:
         for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", example):
             assert re.search(rf"{option}(?![\w-])", text.replace(example, "")) or "Commands" in text, option
+        build_app(name).parse_args(shlex.split(example)[1:], exit_on_error=False, print_error=False)
 
 
 def run_as_written(line: str, folder: Path) -> str:

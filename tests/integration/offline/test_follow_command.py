@@ -138,6 +138,6 @@ def test_bad_input_is_one_line_and_status_2(session: Path, tmp_path: Path, capsy
     assert "truth.csv:" in line
     assert "cannot be read" in line
     assert "--crops needs pictures" in refused(["follow", str(session), *known, "--crops", str(tmp_path)], 2, capsys)
-    assert "--area goes with --truth" in refused(["follow", str(session), *known, "--area", "0,1,0,1"], 2, capsys)
+    assert "--area goes with --truth" in refused(["follow", str(session), *known, "--area", "-1,1,-1,1"], 2, capsys)
     assert "does not exist" in refused(["follow", str(tmp_path / "nothing"), *known], 2, capsys)
     assert not (tmp_path / "out").exists()
