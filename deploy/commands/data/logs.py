@@ -101,7 +101,9 @@ def replay(
     """Publish the messages of a log on the bus at their recorded times, or compare two logs.
 
     Example: syncline replay demo-out/demo.mcap --rate 2
+
     Example: syncline replay a.mcap --compare b.mcap --topics track --tolerance track.position=1e-6
+
     Example: syncline replay demo-out/demo.mcap --through hub --out again.mcap
 
     A comparison reports count, order and every field beyond its tolerance; exit status 3 if the logs differ.
