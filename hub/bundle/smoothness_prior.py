@@ -38,12 +38,12 @@ class SmoothnessPrior:
 class PathScatter:
     """Extent of a path in all directions, by which the strength of its prior is normalised.
 
-    held: (m,) knot intervals whose control points are held by rows of two cameras (`_held`). control_mask: (size,)
-    control points of these. floor: added to the diagonal of their scatter matrix S. scale: of the metric
-    ``scale * S⁻¹``, in which the prior has the strength that was estimated.
+    seen: (m,) knot intervals that two cameras see. control_mask: (size,) control points of those that are `_held`.
+    floor: added to the diagonal of their scatter matrix S. scale: of the metric ``scale * S⁻¹``, in which the prior has
+    the strength that was estimated.
     """
 
-    held: Bools
+    seen: Bools
     control_mask: Bools
     floor: float
     scale: float
@@ -65,13 +65,15 @@ def estimate_smoothness(problem: Problem, state: AdjustmentState, weak: bool = F
             if rows.label == label:
                 index, _, inside = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[rows.use]))[:3]
                 seen[rows.camera, index[inside]] = True
-        held = _held(seen.sum(axis=0)[path.basis.interval_starts()] >= 2, path.basis.interval_starts())
+        starts = path.basis.interval_starts()
+        seen_by_two = seen.sum(axis=0)[starts] >= 2
+        held = _held(seen_by_two, starts)
         chosen = differences[held] if held.sum() >= 4 else differences
         variance = float(np.mean(chosen**2)) if len(chosen) else 1.0
         scale = float(np.median(np.ptp(path.control, axis=0))) or 1.0
         variance = max(variance, (1e-6 * scale) ** 2)
         weights.append(np.full(count, (1e-3 if weak else 1.0) / variance))
-        scatters.append(None if weak else _path_scatter(path, held))
+        scatters.append(None if weak else _path_scatter(path, seen_by_two, held))
     return SmoothnessPrior(tuple(weights), tuple(scatters))
 
 
@@ -88,7 +90,7 @@ def _held(seen: Bools, starts: Ints) -> Bools:
     return held
 
 
-def _path_scatter(path: Trajectory, held: Bools) -> PathScatter | None:
+def _path_scatter(path: Trajectory, seen: Bools, held: Bools) -> PathScatter | None:
     """The scatter that normalises the prior's strength; None for a path of which two cameras see hardly anything.
 
     A smaller or flatter path has smaller third differences: a prior of fixed strength prefers both, and cameras follow
@@ -106,7 +108,7 @@ def _path_scatter(path: Trajectory, held: Bools) -> PathScatter | None:
     differences = third_differences(path.basis, path.control)[held]
     inverse = np.linalg.inv(_scatter(path.control[control_mask], floor))
     plain, metric = float((differences**2).sum()), float(((differences @ inverse) * differences).sum())
-    return PathScatter(held, control_mask, floor, plain / metric) if metric > 0.0 else None
+    return PathScatter(seen, control_mask, floor, plain / metric) if metric > 0.0 else None
 
 
 def _centred(control: Floats) -> Floats:
@@ -132,7 +134,7 @@ def smoothness_terms(path: Trajectory, weight: Floats, scatter: PathScatter | No
     if scatter is None:
         return third_difference_band(path.basis, weight, np.eye(3)), gradient, value
     control = path.control[scatter.control_mask]
-    inside, outside = np.where(scatter.held, weight, 0.0), np.where(scatter.held, 0.0, weight)
+    inside, outside = np.where(scatter.seen, weight, 0.0), np.where(scatter.seen, 0.0, weight)
     moment = (inside[:, None] * differences).T @ differences
     gradient.reshape(-1, 3)[scatter.control_mask] -= (
         scatter.scale / len(control) * _centred(control) @ inverse @ moment @ inverse
@@ -152,5 +154,5 @@ def _half_gradient(
     inverse: Floats = np.asarray(
         np.linalg.inv(_scatter(path.control[scatter.control_mask], scatter.floor)), dtype=np.float64
     )
-    half_gradients = np.where(scatter.held[:, None], differences @ (scatter.scale * inverse), differences)
+    half_gradients = np.where(scatter.seen[:, None], differences @ (scatter.scale * inverse), differences)
     return weight[:, None] * half_gradients, inverse

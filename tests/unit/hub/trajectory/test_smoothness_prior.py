@@ -56,10 +56,10 @@ def test_the_cost_is_invariant_under_the_paths_scale() -> None:
     centre = path.control.mean(axis=0)
     at, larger = (value(path, prior, centre + factor * (path.control - centre)) for factor in (1.0, 1.0001))
     assert at > 10.0
-    assert abs(larger - at) < 0.15 * 2e-4 * at  # not exactly: where rows hardly hold the path it is not normalised
+    assert abs(larger - at) < 0.1 * 2e-4 * at
     plain = SmoothnessPrior(prior.weights, ())
     gradient = smoothness_terms(path, plain.weights[0], None)[1]
-    assert gradient @ (path.control - centre).ravel() == pytest.approx(at, rel=1e-6)
+    assert gradient @ (path.control - centre).ravel() == pytest.approx(at, rel=0.03)  # the strength is the inner intervals'
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -70,7 +70,7 @@ def test_the_cost_is_invariant_under_affine_maps_of_the_path(seed: int) -> None:
     centre = path.control.mean(axis=0)
     size = prior.scatters[0]
     assert size is not None
-    seen = SmoothnessPrior((np.where(size.held, prior.weights[0], 0.0),), prior.scatters)
+    seen = SmoothnessPrior((np.where(size.seen, prior.weights[0], 0.0),), prior.scatters)
     picture = np.eye(3) + 0.3 * np.random.default_rng(seed).normal(size=(3, 3))
     at, other = (value(path, seen, centre + (path.control - centre) @ one) for one in (np.eye(3), picture))
     assert other == pytest.approx(at, rel=0.02)  # except for the floor of the scatter
