@@ -59,7 +59,7 @@ def test_the_cost_is_invariant_under_the_paths_scale() -> None:
     assert abs(larger - at) < 0.1 * 2e-4 * at
     plain = SmoothnessPrior(prior.weights, ())
     gradient = smoothness_terms(path, plain.weights[0], None)[1]
-    assert gradient @ (path.control - centre).ravel() == pytest.approx(at, rel=0.03)  # the strength is the inner intervals'
+    assert gradient @ (path.control - centre).ravel() == pytest.approx(at, rel=0.03)  # of inner intervals
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
