@@ -47,7 +47,6 @@ UAV_MESSAGES = (
 """The messages of a UAV agent; all have its name in the field ``agent``."""
 _CLASSES: Mapping[str, type[Message]] = {topic.message: getattr(pb, topic.message) for topic in TOPICS}
 _LAYOUTS = Layouts()
-_check_names = lru_cache(maxsize=8192)(check_names)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +115,7 @@ def decode(topic: Topic, payload: bytes) -> Message:
 def _check_observation(message: pb.Observation, payload: bytes) -> None:
     """``check``, by the layout of earlier observations where one matches."""
     if _LAYOUTS.match(payload):
-        _check_names(message.camera, message.boot_id)
+        check_names(message.camera, message.boot_id)
     else:
         check(message)
         _LAYOUTS.learn(payload)

@@ -25,7 +25,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -104,22 +104,15 @@ class Backfill(Generic[_Source]):
 
     def take(self, source: _Source, number: int, key: str, payload: bytes) -> None:
         """Process a message from the transport; duplicates by sequence number are discarded."""
-        self.take_all(((source, number, key, payload),))
-
-    def take_all(self, messages: Iterable[tuple[_Source, int, str, bytes]]) -> None:
-        """Process several in order: source, number, key and payload of each."""
-        questions = []
+        who = key, source
         with self._lock:
-            following, push = self._next, self._push
-            for source, number, key, payload in messages:
-                who = key, source
-                expected = following.get(who)
-                if expected == number:  # nearly always the case
-                    following[who] = (number + 1) % _SEQUENCE_MODULUS
-                    push(source, key, payload)
-                elif (question := self._out_of_sequence(who, expected, number, payload)) is not None:
-                    questions.append(question)
-        for question in questions:
+            expected = self._next.get(who)
+            if expected == number:  # nearly always the case
+                self._next[who] = (number + 1) % _SEQUENCE_MODULUS
+                self._push(source, key, payload)
+                return
+            question = self._out_of_sequence(who, expected, number, payload)
+        if question is not None:
             self._ask(question)
 
     def answer(self, query: RecoveryQuery[_Source], number: int, key: str, payload: bytes) -> None:
