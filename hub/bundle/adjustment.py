@@ -42,7 +42,7 @@ from protocols.session.calibration import AdjustmentStep
 
 _OUTLIER_SIGMA = 5.0  # rows beyond this many sigma are rejected as outliers
 _MIN_SIGMA_PX = 0.05  # px
-_COARSE_TOLERANCE, _FINE_TOLERANCE = 1e-4, 1e-7  # relative decrease of the cost at which a round, the last have ended
+_COARSE_TOLERANCE, _FINE_TOLERANCE = 1e-4, 1e-7  # relative decrease of the cost that ends a round, and the last one
 
 
 def adjust(

@@ -74,6 +74,7 @@ class AppearanceTracker:
         self._filter = CorrelationFilter(target.width, target.height)
         self._scale, self._flow, self._memory = ScaleFilter(), BoxFlow(), TemplateMemory()
         self._scene.update(image, None)
+        image = self._scene.photometric.corrected(image)  # begun again, what is learnt has the exposure of the first
         self.motion: Motion = STILL
         self._trusted_at = -np.inf
         self._filter.learn(image, self.box)
