@@ -42,6 +42,7 @@ from hub.tracking.filter.manoeuvre import (
     within_reach,
 )
 from hub.tracking.filter.measurement import PredictedMeasurement, measurements_of, predict_measurement
+from hub.tracking.filter.prediction import predict_targets
 from hub.tracking.filter.target_models import KIND_INDEX, TARGET_MODELS
 from hub.tracking.filter.target_states import DetectionStatistics, MultiTargetState, Scan, ScanFrame, Targets
 from hub.tracking.parameters import TrackerParameters, track_label
@@ -56,13 +57,7 @@ _BIRTH_SPREAD_M, _BIRTH_EXISTENCE = 5.0, 0.1
 """Std of a new target's position, and its probability, before anything is measured of it."""
 _MANOEUVRING = 0.8
 """Probability of detecting a target that may manoeuvre inside its gate."""
-_LIFETIME_S = 60.0
-"""Mean time that a target stays, where nothing is seen of it."""
 _MIN_COLOUR_GAIN = 0.02
-_LOG_SIZE_PSD = 1e-4
-_WALKING_M_S, _STANDING_SHARE = 0.4, 0.05
-"""Turning and swaying grow with speed: somebody who stands has this share of a walker's acceleration (variance)."""
-_ACCELERATION_PSD, _VELOCITY_PSD = np.array([(model.acceleration_psd, model.velocity_psd) for model in TARGET_MODELS]).T
 _UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 
 
@@ -100,24 +95,6 @@ def process_frame(
         unassociated=unassociated,
     )
     return manage_tracks(initiate_tracks(state, frame, cameras, parameters), elapsed, parameters)
-
-
-def predict_targets(targets: Targets, elapsed: Floats | float, parameters: TrackerParameters) -> Targets:
-    """The targets predicted by ``elapsed`` seconds, each (n,) or all."""
-    if not len(targets) or not np.any(elapsed):
-        return targets
-    units_per_m = units_of(targets, parameters.scale.units_per_m)
-    speed = np.linalg.norm(targets.mean[:, VELOCITY], axis=1) / units_per_m
-    share = np.clip((speed / _WALKING_M_S) ** 2, _STANDING_SHARE, 1.0)
-    share = np.where(_UPRIGHT[targets.kind], share, 1.0)
-    acceleration_psd, velocity_psd = (
-        psd[targets.kind] * units_per_m**2 * share for psd in (_ACCELERATION_PSD, _VELOCITY_PSD)
-    )
-    mean, covariance = kalman.predict(
-        targets.mean, targets.covariance, elapsed, acceleration_psd, _LOG_SIZE_PSD, velocity_psd
-    )
-    existence = targets.existence * np.exp(-np.maximum(elapsed, 0.0) / _LIFETIME_S)
-    return replace(targets, mean=mean, covariance=covariance, existence=existence)
 
 
 def on_floor(targets: Targets, floor: Floor | None, elapsed: Floats | float) -> Targets:

@@ -203,8 +203,9 @@ class LiveTracking:
     def _tracks(self, state: MultiTargetState) -> list[pb.Track]:
         """Track messages of a state, including state "lost" for published tracks that have ended."""
         assert state.time_ns is not None
-        lost = tuple(one for one in state.lost_tracks if one.number in self._published)
-        out = track_messages(state.targets, state.time_ns, lost, self.tracker.parameters, self._sequence)
+        lost = np.isin(state.lost.number, list(self._published))
+        ended = state.lost.select(lost), state.lost_ns[lost]
+        out = track_messages(state.targets, state.time_ns, ended, self.tracker.parameters, self._sequence)
         self._sequence += len(out)
         self._published = set(state.targets.number[state.targets.confirmed].tolist())
         return out

@@ -8,11 +8,11 @@ from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.filter.measurement import POINT, predict_measurement
 from hub.tracking.filter.target_models import MARKER, TARGET_MODELS
-from hub.tracking.filter.target_states import LostTrack, Targets
+from hub.tracking.filter.target_states import Targets
 from hub.tracking.marker_filter import MarkerState
 from hub.tracking.parameters import TrackerParameters, track_label
 from protocols.core.clocks import NANOSECONDS
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 
 SCHEMA_VERSION = 1  # of the messages
@@ -27,9 +27,12 @@ _MAX_PIXEL = 1e5  # far outside every image
 
 
 def track_messages(
-    targets: Targets, time_ns: int, lost_tracks: tuple[LostTrack, ...], parameters: TrackerParameters, sequence: int
+    targets: Targets, time_ns: int, lost: tuple[Targets, Ints], parameters: TrackerParameters, sequence: int
 ) -> list[pb.Track]:
-    """Messages of confirmed and coasting targets at a reference time, then of the lost tracks."""
+    """Messages of confirmed and coasting targets at a reference time, then of lost tracks, where last seen.
+
+    lost: tracks as predicted to the times (k,) at which they were lost.
+    """
     out: list[pb.Track] = []
     angles = headings(targets.mean, parameters)
     # A track that is as likely to have ended is not published, until it is seen again or lost.
@@ -58,17 +61,19 @@ def track_messages(
             message.height_std = size * float(np.sqrt(covariance[LOG_SIZE, LOG_SIZE]))
         _set_colour(message, targets.colour[i])
         out.append(message)
-    for lost in lost_tracks:
+    ended, lost_ns = lost
+    seen = ended.mean[:, POSITION] - ((lost_ns - ended.seen_ns) / NANOSECONDS)[:, None] * ended.mean[:, VELOCITY]
+    for i, place in enumerate(seen.tolist()):
         out.append(
             pb.Track(
                 schema_version=SCHEMA_VERSION,
                 sequence=sequence + len(out),
-                label=track_label(lost.kind, lost.number),
+                label=track_label(int(ended.kind[i]), int(ended.number[i])),
                 state="lost",
                 reference_time_ns=time_ns,
-                position=lost.mean[POSITION].tolist(),
-                kind=TARGET_MODELS[lost.kind].kind,
-                unseen_s=max(time_ns - lost.seen_ns, 0) / NANOSECONDS,
+                position=place,
+                kind=TARGET_MODELS[int(ended.kind[i])].kind,
+                unseen_s=max(time_ns - int(ended.seen_ns[i]), 0) / NANOSECONDS,
             )
         )
     return out

@@ -21,8 +21,9 @@ from hub.tracking.association.scan import FrameEvidence, associate_jointly
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION
 from hub.tracking.filter.manoeuvre import fused_predictions, manoeuvre_hypothesis, widened_by_evidence
+from hub.tracking.filter.prediction import predict_targets
 from hub.tracking.filter.target_states import ScanFrame, Targets
-from hub.tracking.frame_update import on_floor, predict_targets, prior_of_births
+from hub.tracking.frame_update import on_floor, prior_of_births
 from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats, Ints

@@ -203,7 +203,7 @@ def manage_tracks(state: MultiTargetState, elapsed: float, parameters: TrackerPa
     placed = _UPRIGHT[targets.kind] & (state.floor is not None and state.floor.known)
     placed &= now - targets.born_ns >= _ALONE_S * NANOSECONDS
     ready = (targets.existence >= _CONFIRMED) & (targets.hits >= _MIN_HITS) & ((cameras >= 2) | placed)
-    state = reidentify(state, ~targets.confirmed & ready, parameters.scale)
+    state = reidentify(state, ~targets.confirmed & ready, parameters)
     targets = state.targets
     unseen = (now - targets.seen_ns) / NANOSECONDS
     known = targets.confirmed

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from hub.tracking.detections import FrameDetections, TrackingCamera, frame_detections
+from hub.tracking.filter.prediction import predict_targets
 from hub.tracking.filter.target_states import MultiTargetState, Targets
-from hub.tracking.frame_update import jointly, predict_targets, process_frame
+from hub.tracking.frame_update import jointly, process_frame
 from hub.tracking.lag_buffer import LagBuffer
 from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
@@ -155,24 +156,11 @@ class Tracker:
 
 def transform_state(state: MultiTargetState, change: Similarity) -> MultiTargetState:
     """A state in another world frame. Unassociated detections are dropped, because their cameras have moved."""
-    targets = state.targets
     transform = np.eye(7)
     transform[:3, :3] = transform[3:6, 3:6] = change.scale * change.rotation
-    mean = targets.mean @ transform.T
-    mean[:, :3] += change.shift
-    mean[:, 6] += np.log(change.scale)
-    lost_tracks = []
-    for one in state.lost_tracks:
-        moved_mean = transform @ one.mean
-        moved_mean[:3] += change.shift
-        moved_mean[6] += np.log(change.scale)
-        lost_tracks.append(replace(one, mean=moved_mean))
-    new = replace(targets, mean=mean, covariance=transform @ targets.covariance @ transform.T)
-    return replace(
-        state,
-        targets=new,
-        unassociated={},
-        last_frame_ns={},
-        lost_tracks=tuple(lost_tracks),
-        floor=None,
+    offset = np.concatenate([change.shift, np.zeros(3), [np.log(change.scale)]])
+    targets, lost = (
+        replace(one, mean=one.mean @ transform.T + offset, covariance=transform @ one.covariance @ transform.T)
+        for one in (state.targets, state.lost)
     )
+    return replace(state, targets=targets, lost=lost, unassociated={}, last_frame_ns={}, floor=None)

@@ -58,6 +58,8 @@ class Targets:
 
     def concatenate(self, other: Targets) -> Targets:
         """These targets followed by others."""
+        if not len(self) or not len(other):
+            return self if len(self) else other
         return Targets(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in self.__slots__))
 
     @classmethod
@@ -79,18 +81,6 @@ class Targets:
             np.zeros((0, cameras), dtype=np.int64),
             np.zeros(0),
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LostTrack:
-    """A lost track, kept for re-identification. mean: (7,) state when it was last detected, at seen_ns."""
-
-    number: int
-    kind: int
-    mean: Floats
-    seen_ns: int
-    colour: Floats
-    colour_count: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,9 +127,10 @@ class MultiTargetState:
     """The complete tracker state after a frame: a function of the frames so far, in the order of their keys.
 
     time_ns: reference time of the last frame. unassociated: by camera, the detections of its last frame that are
-    associated with no target. last_frame_ns, statistics: by camera. lost_tracks: oldest first. floor: on which upright
-    targets stand. colour_variance: of one channel, between a detection's colour and the stored colour of its target.
-    scan: the last frames of all cameras, whose association may still change.
+    associated with no target. last_frame_ns, statistics: by camera. lost: tracks kept for re-identification, oldest
+    first, as predicted to the time lost_ns (k,) at which they were lost. floor: on which upright targets stand.
+    colour_variance: of one channel, between a detection's colour and the stored colour of its target. scan: the last
+    frames of all cameras, whose association may still change.
     """
 
     time_ns: int | None
@@ -147,7 +138,8 @@ class MultiTargetState:
     targets: Targets
     unassociated: dict[str, tuple[UnassociatedDetection, ...]]
     last_frame_ns: dict[str, int]
-    lost_tracks: tuple[LostTrack, ...] = ()
+    lost: Targets = field(default_factory=Targets.empty)
+    lost_ns: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     next_initiation_number: int = 1
     next_number: int = 1
     floor: Floor | None = None
@@ -178,6 +170,8 @@ class MultiTargetState:
         """The state with a column for a camera that was not known before."""
         if name in self.cameras:
             return self
-        column = np.full((len(self.targets), 1), -(2**62), dtype=np.int64)
-        seen_by = np.concatenate([self.targets.seen_by, column], axis=1)
-        return replace(self, cameras=(*self.cameras, name), targets=replace(self.targets, seen_by=seen_by))
+        targets, lost = (
+            replace(one, seen_by=np.hstack([one.seen_by, np.full((len(one), 1), -(2**62), dtype=np.int64)]))
+            for one in (self.targets, self.lost)
+        )
+        return replace(self, cameras=(*self.cameras, name), targets=targets, lost=lost)

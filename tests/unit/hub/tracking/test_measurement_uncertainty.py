@@ -94,6 +94,34 @@ def test_occluded_feet_do_not_prevent_initiation() -> None:
     assert np.linalg.norm(targets.mean[targets.confirmed][0, :2] - middle[:2]) < 0.1
 
 
+def test_two_people_who_are_hidden_together_keep_their_numbers() -> None:
+    """A metre apart, of one height and without colours: where each was says who is who."""
+    cameras = ring(5)
+    tracker = Tracker(TrackerParameters(up=UP))
+    tracker.calibrate(cameras)
+    places = np.array([[0.5, 0.0, 0.5 * TALL], [-0.5, 0.0, 0.5 * TALL]])
+    before: dict[int, Floats] = {}
+    for number in range(30):
+        for index, camera in enumerate(cameras.values()):
+            time_ns = round((0.5 * number + 0.02 * index) * NANOSECONDS)
+            both = pb.Observation(
+                schema_version=1, camera=camera.name, boot_id="b", sequence=number,
+                device_time_ns=camera.device_ns(time_ns),
+            )  # fmt: skip
+            for place in places if not 16 <= number < 19 else ():
+                both.MergeFrom(pb.Observation(detections=person(camera, place, time_ns, number).detections))
+            for detection in both.detections:
+                detection.ClearField("colour")
+            tracker.handle(both)
+        targets = tracker.advance().targets
+        if number == 15:
+            places[:, 1] += 0.1
+            before = {int(i): mean[:2] for i, mean in zip(targets.number, targets.mean, strict=True)}
+    assert len(before) == 2
+    for number, mean in zip(targets.number.tolist(), targets.mean, strict=True):
+        assert np.linalg.norm(mean[:2] - before[number]) < 0.3
+
+
 def standing(cameras: dict[str, TrackingCamera], foot: float, seen_by: int) -> MultiTargetState:
     """State with one person whose foot is at a given height, recently seen by some cameras; the floor is at 0."""
     now = NANOSECONDS
@@ -130,7 +158,7 @@ def test_a_target_off_the_floor_seen_by_two_cameras_is_deleted() -> None:
             standing(cameras, foot, seen_by), frame_detections(camera, empty), cameras, TrackerParameters(up=UP)
         )
         assert len(after.targets) == kept, (foot, seen_by)
-        assert len(after.lost_tracks) == 1 - kept, "it is kept for re-identification"
+        assert len(after.lost) == 1 - kept, "it is kept for re-identification"
 
 
 def exact_marginals(ratio: Floats) -> tuple[Floats, Floats]:

@@ -18,8 +18,9 @@ from hub.tracking.association.scan import associate_jointly
 from hub.tracking.detections import TrackingCamera, frame_detections
 from hub.tracking.filter.detection_model import posterior_existence
 from hub.tracking.filter.floor import Floor
+from hub.tracking.filter.prediction import predict_targets
 from hub.tracking.filter.target_states import MultiTargetState
-from hub.tracking.frame_update import predict_targets, process_frame
+from hub.tracking.frame_update import process_frame
 from hub.tracking.offline import FollowResult, follow
 from hub.tracking.parameters import TrackerParameters
 from hub.tracking.smoothing import BatchSmoother

@@ -264,7 +264,7 @@ def test_memory_stays_bounded() -> None:
         tracker.advance()
         assert len(tracker._frames.rows) <= 0.5 * 60 + 3
     assert tracker.state.next_initiation_number > 5
-    assert len(tracker.state.lost_tracks) <= 3
+    assert len(tracker.state.lost) <= 3
     assert len(tracker.targets) <= 2
 
 

@@ -1,0 +1,41 @@
+"""Targets predicted in time: white acceleration, and white velocity for steps and sway."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hub.tracking.filter import kalman
+from hub.tracking.filter.kalman import VELOCITY
+from hub.tracking.filter.manoeuvre import units_of
+from hub.tracking.filter.target_models import TARGET_MODELS
+from hub.tracking.filter.target_states import Targets
+from hub.tracking.parameters import TrackerParameters
+from protocols.geometry.types import Floats
+
+_LIFETIME_S = 60.0
+"""Mean time that a target stays, where nothing is seen of it."""
+_LOG_SIZE_PSD = 1e-4
+_WALKING_M_S, _STANDING_SHARE = 0.4, 0.05
+"""Turning and swaying grow with speed: somebody who stands has this share of a walker's acceleration (variance)."""
+_ACCELERATION_PSD, _VELOCITY_PSD = np.array([(model.acceleration_psd, model.velocity_psd) for model in TARGET_MODELS]).T
+_UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
+
+
+def predict_targets(targets: Targets, elapsed: Floats | float, parameters: TrackerParameters) -> Targets:
+    """The targets predicted by ``elapsed`` seconds, each (n,) or all."""
+    if not len(targets) or not np.any(elapsed):
+        return targets
+    units_per_m = units_of(targets, parameters.scale.units_per_m)
+    speed = np.linalg.norm(targets.mean[:, VELOCITY], axis=1) / units_per_m
+    share = np.clip((speed / _WALKING_M_S) ** 2, _STANDING_SHARE, 1.0)
+    share = np.where(_UPRIGHT[targets.kind], share, 1.0)
+    acceleration_psd, velocity_psd = (
+        psd[targets.kind] * units_per_m**2 * share for psd in (_ACCELERATION_PSD, _VELOCITY_PSD)
+    )
+    mean, covariance = kalman.predict(
+        targets.mean, targets.covariance, elapsed, acceleration_psd, _LOG_SIZE_PSD, velocity_psd
+    )
+    existence = targets.existence * np.exp(-np.maximum(elapsed, 0.0) / _LIFETIME_S)
+    return replace(targets, mean=mean, covariance=covariance, existence=existence)
