@@ -45,7 +45,7 @@ _Queued: TypeAlias = tuple[int, str, bytes, int, str, bool]
 class Inbox:
     """Queues raw samples and returns validated messages. push and count_lost may be called from any thread.
 
-    Decoding happens in ``drain``, on the consumer's thread: a transport's callback must only enqueue,
+    Decoding happens in ``drain``, on the consumer's thread: a transport's thread must only enqueue,
     since a slow one starves every subscription of the session.
     """
 

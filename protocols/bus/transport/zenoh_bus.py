@@ -111,7 +111,7 @@ class _DeclaredKeys:
         self._declared: list[zenoh.KeyExpr] = []
 
     def meet(self, key: str) -> None:
-        """Note a message's key; called from a callback, so nothing is declared here."""
+        """Note a message's key; called from a thread that only enqueues, so nothing is declared here."""
         if len(self.met) < _MAX_KEYS:
             self.met.add(key)
             self._new.append(key)
@@ -270,7 +270,7 @@ class ZenohSubscription(InboxSubscription):
             return super().drain()
 
     def close(self) -> None:
-        """Undeclare: a process with an open callback never exits."""
+        """Undeclare: a process with an open subscription never exits."""
         undeclare_all(self._subscriber)
         self._keys.close()
 
