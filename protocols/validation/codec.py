@@ -58,7 +58,13 @@ class Address:
     agent: str
 
 
-@lru_cache(maxsize=8192)
+_MAX_SENDERS = 8192
+"""Keys, and senders of observations, that are remembered."""
+_SENDERS: dict[tuple[str, str, str], Address] = {}
+"""The address of each key, camera and boot id that were valid together."""
+
+
+@lru_cache(maxsize=_MAX_SENDERS)
 def parse_key(key: str) -> Address | None:
     """The address in a key such as ``syncline/local/camera/cam0/observation``; None for other keys."""
     for topic, pattern in _KEYS:
@@ -127,6 +133,12 @@ def admit(key: str, payload: bytes) -> tuple[Address, Message]:
     A message whose sender differs from the agent in its key is rejected: otherwise an agent that may publish
     only below its own key could publish in another's name.
     """
+    if _LAYOUTS.match(payload):  # what else there is to check are the names
+        try:
+            observation = pb.Observation.FromString(payload)
+            return _SENDERS[key, observation.camera, observation.boot_id], observation
+        except (DecodeError, KeyError):
+            pass
     address = parse_key(key)
     if address is None:
         raise Rejected(RejectionReason.UNKNOWN_KEY, key[:200])
@@ -134,4 +146,8 @@ def admit(key: str, payload: bytes) -> tuple[Address, Message]:
     claimed = message.camera if isinstance(message, pb.Observation) else sender(message)
     if claimed is not None and claimed != address.agent:
         raise Rejected(RejectionReason.WRONG_SENDER, f"{claimed!r} under the key of {address.agent!r}")
+    if isinstance(message, pb.Observation):
+        if len(_SENDERS) >= _MAX_SENDERS:
+            _SENDERS.clear()
+        _SENDERS[key, message.camera, message.boot_id] = address
     return address, message

@@ -12,6 +12,7 @@ gradients are not those of one cost, and a network with a distorted initial shap
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -229,7 +230,7 @@ class Edge:
 
     def drain(self) -> Floats:
         """Return the pending observations (n, 10) and clear them."""
-        fresh = np.array(self._pending).reshape(-1, 10)
+        fresh = np.fromiter(chain.from_iterable(self._pending), float, 10 * len(self._pending)).reshape(-1, 10)
         self._pending.clear()
         return fresh
 

@@ -74,24 +74,23 @@ class LinearisedObservations:
 
 def triangulate(pose: RelativeTransform, rows: Floats, weights: Floats) -> Floats:
     """Points (n, 3) in k's axes by least squares from both rays and the depths given by the sizes."""
-    ray_k = np.ones((len(rows), 3))
-    ray_k[:, :2] = rows[:, 0:2]
-    ray_l = np.ones((len(rows), 3))
-    ray_l[:, :2] = rows[:, 3:5]
-    ray_l = _rotate_rows(ray_l, pose.rotation)
+    rays = np.ones((2, 3, len(rows)))
+    rays[:, :2] = rows.T.reshape(2, 3, -1)[:, :2]
+    ray_k, ray_l = rays[0], _rotate_rows(rays[1].T, pose.rotation).T
+    centre = np.atleast_2d(pose.centre).T
     # depth_k ray_k - depth_l ray_l = centre, least squares in angle; the sizes add weighted depth terms.
-    long_k, long_l = (ray_k * ray_k).sum(axis=1), (ray_l * ray_l).sum(axis=1)
-    across = (ray_k * ray_l).sum(axis=1)
+    long_k, long_l = (ray_k * ray_k).sum(axis=0), (ray_l * ray_l).sum(axis=0)
+    across = (ray_k * ray_l).sum(axis=0)
     # A size with relative std s has std depth * s along the ray; the rays have std depth / weight across it.
-    pull = (weights[:, 1::2] / weights[:, 0::2]) ** 2
-    pull_k, pull_l = pull[:, 0] * long_k, pull[:, 1] * long_l
-    size = np.exp(-rows[:, 2::3])
+    pull = (weights.T[1::2] / weights.T[0::2]) ** 2
+    pull_k, pull_l = pull[0] * long_k, pull[1] * long_l
+    size = np.exp(-rows.T[2::3])
     a, b = long_k + pull_k, long_l + pull_l
-    u = (ray_k * pose.centre).sum(axis=1) + pull_k * size[:, 0]
-    v = pull_l * size[:, 1] - (ray_l * pose.centre).sum(axis=1)
+    u = (ray_k * centre).sum(axis=0) + pull_k * size[0]
+    v = pull_l * size[1] - (ray_l * centre).sum(axis=0)
     ab = a * b
     depth = (b * u + across * v) / np.maximum(ab - across * across, 1e-12 * ab)
-    return np.asarray(ray_k * depth[:, None])
+    return np.asarray((ray_k * depth).T)
 
 
 def _rotate_rows(vectors: Floats, rotation: Floats) -> Floats:
@@ -116,8 +115,9 @@ def linearise_observations(pose: RelativeTransform, rows: Floats, weights: Float
     turn = pose.rotation
     rotation_t = np.swapaxes(turn, -1, -2)
     point = triangulate(pose, rows, weights)
-    seen = rows.reshape(-1, 2, 3)
-    pixel, size = np.ascontiguousarray(weights[:, 0::2]), np.ascontiguousarray(weights[:, 1::2])
+    # Components first: numpy's inner loops are then over the observations, not over two cameras or three components.
+    seen = np.ascontiguousarray(rows.reshape(-1, 2, 3).T)
+    pixel, size = np.ascontiguousarray(weights[:, 0::2].T), np.ascontiguousarray(weights[:, 1::2].T)
     for _ in range(_POINT_STEPS):
         by_l, normal, pull, _, _, _ = _point_information(pose, rotation_t, point, seen, pixel, size)
         step = -(_inverse_symmetric(normal) @ pull[:, :, None])[:, :, 0]
@@ -146,34 +146,34 @@ def _point_information(
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Bools]:
     """Information (n, 3, 3) of the points from l and from both, gradients (n, 3) from both and from l, chi2, in_front.
 
-    All in k's axes. seen: (n, 2, 3); pixel, size: weights (n, 2).
+    All in k's axes. seen: (3, 2, n); pixel, size: weights (2, n).
     """
     n = len(point)
-    local = np.empty((n, 2, 3))
-    local[:, 0] = point
-    local[:, 1] = _rotate_rows(point - pose.centre, rotation_t)
-    depth = local[:, :, 2]
-    floor = _MIN_DEPTH_SHARE * np.abs(local).max(axis=2) + 1e-12
-    in_front = (depth > floor).all(axis=1)
-    safe = np.maximum(depth, floor)
+    local = np.empty((3, 2, n))
+    local[:, 0] = point.T
+    local[:, 1] = _rotate_rows(point - pose.centre, rotation_t).T
+    floor = _MIN_DEPTH_SHARE * np.abs(local).max(axis=0) + 1e-12
+    in_front = (local[2] > floor).all(axis=0)
+    safe = np.maximum(local[2], floor)
     over = 1.0 / safe
-    normalised = local[:, :, :2] * over[:, :, None]
+    normalised = local[:2] * over
     a, b = over * pixel, over * size
-    off = (normalised - seen[:, :, :2]) * pixel[:, :, None]
-    far = (np.log(safe) + seen[:, :, 2]) * -size
-    pull = np.empty((n, 2, 3))
-    pull[:, :, :2] = off * a[:, :, None]
-    pull[:, :, 2] = -(pull[:, :, :2] * normalised).sum(axis=2) - b * far
-    information = np.zeros((n, 2, 3, 3))
+    off = (normalised - seen[:2]) * pixel
+    far = (np.log(safe) + seen[2]) * -size
+    pull = np.empty((3, 2, n))
+    pull[:2] = off * a
+    pull[2] = -(pull[:2] * normalised).sum(axis=0) - b * far
+    information = np.zeros((2, n, 3, 3))
     square = a * a
     information[:, :, 0, 0] = information[:, :, 1, 1] = square
-    aslant = normalised * -square[:, :, None]
-    information[:, :, :2, 2] = information[:, :, 2, :2] = aslant
-    information[:, :, 2, 2] = b * b - (aslant * normalised).sum(axis=2)
-    by_l = rotation_t @ information[:, 1] @ pose.rotation
-    pull_l = _rotate_rows(pull[:, 1], pose.rotation)
-    chi2 = (off * off).sum(axis=(1, 2)) + (far * far).sum(axis=1)
-    return by_l, information[:, 0] + by_l, pull[:, 0] + pull_l, pull_l, chi2, np.asarray(in_front)
+    aslant = normalised * -square
+    information[:, :, 0, 2] = information[:, :, 2, 0] = aslant[0]
+    information[:, :, 1, 2] = information[:, :, 2, 1] = aslant[1]
+    information[:, :, 2, 2] = b * b - (aslant * normalised).sum(axis=0)
+    by_l = rotation_t @ information[1] @ pose.rotation
+    pull_l = _rotate_rows(pull[:, 1].T, pose.rotation)
+    chi2 = (off * off).sum(axis=(0, 1)) + (far * far).sum(axis=0)
+    return by_l, information[0] + by_l, pull[:, 0].T + pull_l, pull_l, chi2, np.asarray(in_front)
 
 
 def _inverse_symmetric(m: Floats) -> Floats:

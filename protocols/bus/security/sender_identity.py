@@ -110,10 +110,18 @@ class SenderCheckedSubscription:
         """The accepted messages since the last call."""
         self._bus.update_agents()
         accepted, refuse, now = [], self._bus.guard.refuse, self._bus.now()
+        passed: set[tuple[str, str, str]] = set()  # who is accepted once is accepted at that time
         for received in self._inner.drain():
+            topic, agent, message, _, source = received
+            who = agent, getattr(message, "boot_id", ""), source
+            if who in passed:
+                accepted.append(received)
+                continue
             why = refuse(received, now)
             if why is None:
                 accepted.append(received)
+                if topic is not STATUS:  # whose role is in the message
+                    passed.add(who)
                 continue
             reason, detail = why
             self._refused[f"rejected.{reason.value}"] += 1

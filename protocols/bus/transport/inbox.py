@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from itertools import chain
 from typing import TypeAlias
 
 from google.protobuf.message import Message
@@ -35,14 +36,16 @@ _MAX_ALIVE = 16_384
 _MAX_REFUSALS = 256
 """Rejections that are kept for reports; all of them are counted."""
 
-_Queued: TypeAlias = tuple[int, bytes, int, str, bool]
-"""Order, payload, arrival [ns], source, whether the transport counts its publisher's messages."""
+Arrived: TypeAlias = tuple[str, bytes, int, str, bool]
+"""Key, payload, arrival [ns], source, whether the transport counts its publisher's messages."""
+_Queued: TypeAlias = tuple[int, str, bytes, int, str, bool]
+"""The order before that."""
 
 
 class Inbox:
     """Queues raw samples and returns validated messages. push and count_lost may be called from any thread.
 
-    Decoding happens in ``drain``, on the consumer's thread: a transport's callback must only enqueue,
+    Decoding happens in ``drain``, on the consumer's thread: a transport's thread must only enqueue,
     since a slow one starves every subscription of the session.
     """
 
@@ -58,7 +61,7 @@ class Inbox:
         self._bulky = topic.bulky
         self._newest: dict[tuple[str, str], int] = {}
         self._refusals: list[Refusal] = []
-        self._ready = threading.Condition()
+        self._ready = threading.Condition()  # its lock is re-entrant
         self._counts: Counter[str] = Counter(received=0, dropped=0, lost=0)
 
     def push(self, key: str, payload: bytes, source: str = "", *, numbered: bool = True) -> None:
@@ -66,31 +69,49 @@ class Inbox:
 
         numbered: whether the transport counts its publisher's messages; otherwise losses show in their own numbers.
         """
-        size = len(payload)
-        if size > MAX_PAYLOAD:
-            self.refuse(Rejected(RejectionReason.OVERSIZED, f"{size} bytes, at most {MAX_PAYLOAD}"), key)
-            return
-        now = self._clock_ns()
+        self.push_all(deque([(key, payload, self._clock_ns(), source, numbered)]))
+
+    def push_all(self, arrived: deque[Arrived]) -> None:
+        """The same of several, which are removed from ``arrived``: whoever calls it, they are queued in its order."""
         with self._ready:
-            if not self._bulky and not self._affords(key, size, now):
-                self._counts["dropped"] += 1
-                return
-            self._order += 1
-            queue = self._queues.get(key)
-            if queue is None:
-                queue = self._queues[key] = deque()
-            queue.append((self._order, payload, now, source, numbered))
-            self._add(key, 1, size)
-            if self._length == 1:  # nobody waits while there is more
-                self._ready.notify_all()
-            while self._sizes[key] > self._most_of_key:
-                self._drop(key)
+            was_empty = self._length == 0
+            groups: dict[str, list[_Queued]] = {}
+            for _ in range(len(arrived)):
+                one = arrived.popleft()
+                self._order += 1
+                groups.setdefault(one[0], []).append((self._order, *one))
+            for key, queued in groups.items():
+                self._queue(key, queued)
             while self._length > self._capacity or self._bytes > self._most:
                 by_count = self._length > self._capacity
                 self._drop(max(self._queues, key=lambda one: len(self._queues[one]) if by_count else self._sizes[one]))
+            if was_empty and self._length:  # nobody waits while there is more
+                self._ready.notify_all()
+
+    def _queue(self, key: str, queued: list[_Queued]) -> None:
+        sizes = [len(one[2]) for one in queued]
+        if max(sizes) > MAX_PAYLOAD or not self._affords(key, sum(sizes), queued[0][3]):
+            queued = [one for one in queued if self._passes(key, len(one[2]), one[3])]
+            sizes = [len(one[2]) for one in queued]
+        if queued:
+            self._queues.setdefault(key, deque()).extend(queued)
+            self._add(key, len(queued), sum(sizes))
+        while self._sizes[key] > self._most_of_key:
+            self._drop(key)
+
+    def _passes(self, key: str, size: int, now: int) -> bool:
+        """Whether one message is queued; counted if not."""
+        if size > MAX_PAYLOAD:
+            self.refuse(Rejected(RejectionReason.OVERSIZED, f"{size} bytes, at most {MAX_PAYLOAD}"), key)
+            return False
+        good = self._affords(key, size, now)
+        self._counts["dropped"] += not good
+        return good
 
     def _affords(self, key: str, size: int, now: int) -> bool:
         """Whether a sender has not sent too many bytes lately."""
+        if self._bulky:
+            return True
         known = self._credit.get(key)
         if known is None:
             if len(self._credit) >= _MAX_ALIVE:
@@ -110,7 +131,7 @@ class Inbox:
         self._sizes[key] += size
 
     def _drop(self, key: str) -> None:
-        self._add(key, -1, -len(self._queues[key].popleft()[1]))
+        self._add(key, -1, -len(self._queues[key].popleft()[2]))
         if not self._queues[key]:
             del self._queues[key], self._sizes[key]
         self._counts["dropped"] += 1
@@ -146,8 +167,9 @@ class Inbox:
             queues = self._taken()
         messages: list[Received] = []
         # Sorting joins the queues, each of them in order, faster than a heap that is merged in Python.
-        merged = sorted([(item[0], key, item) for key, queue in queues.items() for item in queue])
-        for _, key, (_, payload, arrival_ns, source, numbered) in merged:
+        merged = sorted(chain.from_iterable(queues.values())) if len(queues) > 1 else [*chain(*queues.values())]
+        new = tuple.__new__  # half of what Received's own takes
+        for _, key, payload, arrival_ns, source, numbered in merged:
             try:
                 address, message = admit(key, payload)
             except Rejected as error:
@@ -155,7 +177,7 @@ class Inbox:
                 continue
             if not numbered:
                 self._count_gap(key, message)
-            messages.append(Received(address.topic, address.agent, message, arrival_ns, source))
+            messages.append(new(Received, (address.topic, address.agent, message, arrival_ns, source)))
         with self._ready:
             self._counts["received"] += len(messages)
         return messages
@@ -175,16 +197,16 @@ class Inbox:
         for key in sorted(self._queues, key=lambda one: self._sizes[one] > share_bytes):
             queue = self._queues[key]
             taken, size = [queue.popleft()], 0
-            while queue and len(taken) < share and (size := size + len(taken[-1][1])) < share_bytes:
+            while queue and len(taken) < share and (size := size + len(taken[-1][2])) < share_bytes:
                 taken.append(queue.popleft())
             queues[key] = taken
-            self._add(key, -len(taken), -sum(len(item[1]) for item in taken))
+            self._add(key, -len(taken), -sum(len(item[2]) for item in taken))
             del self._queues[key]
             if queue:
                 self._queues[key] = queue
             else:
                 del self._sizes[key]
-            total += sum(len(item[1]) for item in taken)
+            total += sum(len(item[2]) for item in taken)
             if total >= _MAX_DRAIN_BYTES and not self._bulky:
                 break
         return queues

@@ -80,6 +80,50 @@ def test_a_gap_that_zenoh_gave_up_is_asked_for_until_the_cache_has_answered(monk
         assert subscription.counters["lost"] == 0
 
 
+def test_one_message_that_cannot_be_taken_costs_no_other(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Else the subscription would be silent from then on, and Zenoh would wait for it with all others."""
+    take, failed = ZenohSubscription._take, []
+
+    def failing_once(self: ZenohSubscription, sample: zenoh.Sample) -> None:
+        if sample.source_info is not None and sample.source_info.source_sn == 5 and not failed:
+            failed.append(sample)
+            raise ValueError("this one")
+        take(self, sample)
+
+    monkeypatch.setattr(ZenohSubscription, "_take", failing_once)
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
+        for index in range(20):
+            publisher.put(observation("cam0", index))
+        assert sequences(collect(subscription, 20)) == list(range(20)), "it is fetched from the cache"
+    assert failed
+    assert "ValueError: this one" in capsys.readouterr().err
+
+
+def test_more_messages_than_the_channel_holds_arrive_while_nobody_drains() -> None:
+    """And in order; a closed subscription leaves no thread behind, and what is queued can still be drained."""
+    endpoint, threads = free_endpoint(), threading.active_count()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        assert threading.active_count() == threads + 1
+        publisher = matched(sending.publisher(OBSERVATION, "cam0", rate_hz=1000.0, block=True))
+        for index in range(5000):
+            publisher.put(observation("cam0", index))
+        assert eventually(lambda: subscription.inbox._length == 5000)
+        subscription.close()
+        assert eventually(lambda: threading.active_count() == threads)
+        received = [item for _ in range(20) for item in subscription.drain()]
+        assert sequences(received) == list(range(5000))
+        arrivals = [item.arrival_ns for item in received]
+        assert arrivals == sorted(arrivals)
+
+
 def test_keys_that_messages_arrive_under_are_declared_once_and_forgotten() -> None:
     """Else Zenoh seeks the way of every message anew among all keys."""
     endpoint = free_endpoint()

@@ -247,6 +247,18 @@ def test_the_key_says_who_speaks() -> None:
         admit(STATUS.key_for("local", "hub"), encode(status("cam0")))
 
 
+def test_who_was_admitted_once_is_known_by_key_name_and_run_together() -> None:
+    """The names of a known sender are not looked up again, and nobody else gains by it."""
+    own, payload = OBSERVATION.key_for("local", "cam0"), encode(observation("cam0"))
+    assert admit(own, payload) == admit(own, payload)
+    for key in (OBSERVATION.key_for("local", "cam1"), CAMERA_INFO.key_for("local", "cam0"), "syncline/local/cam0"):
+        with pytest.raises(Rejected):
+            admit(key, payload)
+    for camera, boot in (("cam1", "boot-1"), ("cam0", "boot/1"), ("", "boot-1")):
+        with pytest.raises(Rejected):
+            admit(own, observation(camera, boot_id=boot).SerializeToString())
+
+
 @pytest.mark.parametrize("name", ["agent_2", "CVLab1", "GoPro 2", "Kamera.Süd"])
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
 def test_every_key_of_the_catalogue_is_read_back(topic: Topic, name: str) -> None:
