@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtri
 
 from hub.bundle.bordered_system import solve
 from hub.bundle.normal_equations import assemble, weigh_residuals
@@ -33,6 +32,7 @@ from hub.bundle.problem import (
 )
 from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
+from hub.trajectory.compiled import chdtri
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics

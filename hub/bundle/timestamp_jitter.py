@@ -14,11 +14,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import fdtri
 
 from hub.bundle.adjustment import adjust
 from hub.bundle.problem import OFFSET, AdjustmentState, Problem
 from hub.bundle.residuals import linearise
+from hub.trajectory.compiled import fdtri
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry.types import Bools, Floats, Ints
 

@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri, gammainc, gammaln
 
 from hub.sync.lag_scan import (
     MONOMIAL_INDEX,
@@ -24,6 +23,7 @@ from hub.sync.lag_scan import (
     taubin_normalisation,
     to_grid_coordinates,
 )
+from hub.trajectory.compiled import chdtri, gammainc, gammaln
 from hub.trajectory.image_tracks import SmoothTrack
 from protocols.geometry.types import Floats, Ints
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg.lapack import dpbsv
 
+from hub.trajectory.banded import solve_banded
 from protocols.geometry.types import Bools, Floats, Ints
 
 SUPPORT = 4
@@ -220,10 +220,7 @@ def fit_spline(
         weighted = used * weights[:, k]
         for d in range(values.shape[1]):
             target[:, d] += np.bincount(index + k, weighted * values[:, d], minlength=basis.size)
-    _, control, info = dpbsv(bands, target, overwrite_ab=1, overwrite_b=1)  # scipy's own wrapper takes as long again
-    if info:
-        raise np.linalg.LinAlgError("the normal matrix of a spline is not positive definite")
-    return np.asarray(control)
+    return solve_banded(bands, target)
 
 
 def split_at_gaps(time: Floats, max_gap: float, part: Ints | None = None) -> tuple[Floats, Floats]:

@@ -217,9 +217,8 @@ def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 
     a, b: normalised points (n, 2). threshold: inlier distance in normalised coordinates. subset: largest number of
     pairs used. Empty for fewer than 8 pairs or where no matrix is found.
     """
-    rng = np.random.default_rng(seed)
     poses: list[RelativePose] = []
-    pick = rng.permutation(len(a))[:subset] if len(a) > subset else np.arange(len(a))
+    pick = np.random.default_rng(seed).permutation(len(a))[:subset] if len(a) > subset else np.arange(len(a))
     if len(pick) < 8:
         return poses
     cv2.setRNGSeed(seed)

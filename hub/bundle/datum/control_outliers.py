@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from scipy.special import chdtri, fdtri
 
 from hub.bundle.datum.gauge import (
     CONTRADICTION_SIGMA,
@@ -16,6 +15,7 @@ from hub.bundle.datum.gauge import (
     fit_to_control_points,
 )
 from hub.bundle.problem import CAMERA_PARAMETERS
+from hub.trajectory.compiled import chdtri, fdtri
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats
