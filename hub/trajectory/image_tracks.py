@@ -60,7 +60,7 @@ class SmoothTrack:
     discontinuities: Floats = field(default_factory=lambda: np.zeros(0))
     """(k,) times [s] at which the detector probably switched to another object."""
     polynomials: Floats = field(init=False)
-    """(size - 3, 4, 2) of the spline: refinements evaluate it hundreds of times."""
+    """(4, 2, size - 3) of the spline: refinements evaluate it hundreds of times."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "polynomials", self.basis.polynomials(self.control))

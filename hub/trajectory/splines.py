@@ -75,20 +75,22 @@ class SplineBasis:
         return np.concatenate([start + width * (np.arange(count + 3) - 1.0) for start, width, count in each])
 
     def locate(self, time: Floats, extrapolation: float = 0.0) -> tuple[Ints, Floats, Bools, Floats]:
-        """First control point (n,), parameter u in the knot interval (n,), inside a stretch (n,), interval width (n,).
+        """First control point (n,), parameter u in the knot interval (n,), inside a stretch (n,), interval width.
+
+        The width is (n,), or (1,) where all are alike.
 
         extrapolation: knot intervals by which a stretch's end polynomials are extended; there u is outside [0, 1].
         """
+        if len(self.starts) == 1 and len(time):  # no gaps: most tracks, and half of the time
+            last = float(self.intervals[0])
+            place = (time - self.starts[0]) / self.widths[0]
+            if np.minimum.reduce(place) >= 0.0 and np.maximum.reduce(place) <= last + extrapolation + 1e-9:  # no NaN
+                interval = np.minimum(place, last - 1.0).astype(np.int64)
+                place -= interval
+                return interval, place, np.ones(len(place), dtype=np.bool_), self.widths
         known = np.isfinite(time)
         if not known.all():
             time = np.where(known, time, self.starts[0])
-        if len(self.starts) == 1:  # no gaps: most tracks, and half of the time
-            last = float(self.intervals[0])
-            place = (time - self.starts[0]) / self.widths[0]
-            known &= (place >= -extrapolation) & (place <= last + extrapolation + 1e-9)
-            interval = np.clip(place, 0.0, last - 1.0).astype(np.int64)
-            place -= interval
-            return interval, place, known, np.full(len(place), self.widths[0])
         stretch = np.searchsorted(self.starts - extrapolation * self.widths, time, side="right") - 1
         inside = known & (stretch >= 0)
         np.maximum(stretch, 0, out=stretch)
@@ -128,17 +130,25 @@ class SplineBasis:
         return values
 
     def polynomials(self, control: Floats) -> Floats:
-        """(size - 3, 4, d) coefficients of 1, u, u², u³ in the knot interval that begins at each control point."""
-        return np.asarray(
-            _POWERS @ np.lib.stride_tricks.sliding_window_view(control, SUPPORT, axis=0).transpose(0, 2, 1)
-        )
+        """(4, d, size - 3) coefficients of 1, u, u², u³ in the knot interval that begins at each control point."""
+        size = len(control) - SUPPORT + 1
+        points = np.stack([control[k : k + size].T for k in range(SUPPORT)])
+        return np.asarray((_POWERS @ points.reshape(SUPPORT, -1)).reshape(points.shape))
 
     def evaluate_with_derivatives(self, polynomials: Floats, time: Floats) -> tuple[Floats, Floats]:
         """Values and first derivatives, (n, d) each, at ``time``, of a spline's `polynomials`; NaN outside."""
         index, u, inside, width = self.locate(time)
-        constant, first, second, third = polynomials.take(index, axis=0).transpose(1, 2, 0)
-        values = ((third * u + second) * u + first) * u + constant
-        slopes = ((3.0 * third * u + 2.0 * second) * u + first) / width
+        constant, first, second, third = polynomials.take(index, axis=2)
+        slopes = third * u  # Horner's scheme for both, in place
+        values = slopes + second
+        slopes += values
+        values *= u
+        values += first
+        slopes *= u
+        slopes += values
+        slopes /= width
+        values *= u
+        values += constant
         if not inside.all():
             values[:, ~inside] = np.nan
             slopes[:, ~inside] = np.nan

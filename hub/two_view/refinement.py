@@ -29,8 +29,8 @@ _MIN_ROWS = 12  # twice the six unknowns of a relative pose and a lag
 class PointPairs:
     """Corresponding normalised points.
 
-    a, b: (n, 2). velocity_b: (n, 2) derivative of b by b's time [1/s]. centred_time: (n,) time of a minus the
-    samples' centre [s].
+    a, b: (n, 2), fastest where a coordinate lies together. velocity_b: (n, 2) derivative of b by b's time [1/s].
+    centred_time: (n,) time of a minus the samples' centre [s].
     """
 
     a: Floats
@@ -132,7 +132,7 @@ def _linearise(
     noise: NoiseModel,
     fixed_geometry: bool,
 ) -> tuple[Floats, Floats] | None:
-    """Residuals (n,) in units of the noise and their Jacobian (n, k + 2); None without overlap.
+    """Residuals (n,) in units of the noise and their Jacobian (k + 2, n); None without overlap.
 
     Parameters: the geometry's local ones (none if it is fixed), intercept, inverse rate.
     """
@@ -140,27 +140,28 @@ def _linearise(
     count = len(pairs.a)
     if count < _MIN_ROWS:
         return None
-    matrix = geometry.matrix
-    line_b = pairs.a @ matrix[:, :2].T
-    line_b += matrix[:, 2]
-    line_a = pairs.b @ matrix[:2, :2]
-    line_a += matrix[2, :2]
-    variance = noise.sigma_b**2 * (line_b[:, 0] ** 2 + line_b[:, 1] ** 2)
-    variance += noise.sigma_a**2 * (line_a[:, 0] ** 2 + line_a[:, 1] ** 2)
+    matrix, a, b = geometry.matrix, pairs.a.T, pairs.b.T
+    line_b = matrix[:, :2] @ a
+    line_b += matrix[:, 2:]
+    line_a = matrix[:2, :2].T @ b
+    line_a += matrix[2, :2, None]
+    variance = np.einsum("in,in->n", line_b[:2], line_b[:2])
+    variance *= noise.sigma_b**2
+    variance += noise.sigma_a**2 * np.einsum("in,in->n", line_a, line_a)
     over = 1.0 / np.sqrt(np.maximum(variance, 1e-30))
-    residual = (pairs.b[:, 0] * line_b[:, 0] + pairs.b[:, 1] * line_b[:, 1] + line_b[:, 2]) * over
+    residual = np.einsum("in,in->n", b, line_b[:2])
+    residual += line_b[2]
+    residual *= over
     free = 0 if fixed_geometry else 5 if isinstance(geometry, RelativePose) else 7
-    jacobian = np.empty((count, free + 2))
+    jacobian = np.empty((free + 2, count))
     if free:
-        products = np.empty((count, 3, 3))
-        products[:, :2, :2] = pairs.b[:, :, None] * pairs.a[:, None, :]
-        products[:, 2, :2] = pairs.a
-        products[:, :2, 2] = pairs.b
-        products[:, 2, 2] = 1.0
-        jacobian[:, :free] = products.reshape(count, 9) @ geometry.tangents().reshape(free, 9).T
-    jacobian[:, free] = line_b[:, 0] * pairs.velocity_b[:, 0] + line_b[:, 1] * pairs.velocity_b[:, 1]
-    jacobian[:, free + 1] = jacobian[:, free] * pairs.centred_time
-    jacobian *= over[:, None]
+        products = np.empty((3, 3, count))
+        np.multiply(b[:, None], a, out=products[:2, :2])
+        products[2, :2], products[:2, 2], products[2, 2] = a, b, 1.0
+        np.matmul(geometry.tangents().reshape(free, 9), products.reshape(9, count), out=jacobian[:free])
+    np.einsum("in,in->n", line_b[:2], pairs.velocity_b.T, out=jacobian[free])
+    np.multiply(jacobian[free], pairs.centred_time, out=jacobian[free + 1])
+    jacobian *= over
     return residual, jacobian
 
 
@@ -169,10 +170,11 @@ def _normal_equations(
 ) -> tuple[Floats, Floats, float]:
     """Normal matrix, gradient and mean robust cost of `_linearise`'s rows, with Cauchy weights of a width."""
     residual, jacobian = rows
-    ratio = (residual / width) ** 2
-    weighted = jacobian / (1.0 + ratio)[:, None]
-    normal = weighted.T @ jacobian
-    gradient = weighted.T @ residual
+    ratio = residual / width
+    ratio *= ratio
+    weighted = jacobian / (1.0 + ratio)
+    normal = weighted @ jacobian.T
+    gradient = weighted @ residual
     prior = 1.0 / noise.rate_prior_std**2
     normal[-1, -1] += prior
     gradient[-1] += prior * (inverse_rate - 1.0)

@@ -6,6 +6,7 @@ The published fundamental matrix is the transpose, ``m_aᵀ F m_b = 0`` (asynchr
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from hub.two_view.fundamental import hartley_normalisation
 from protocols.geometry import so3
+from protocols.geometry.order_statistics import median
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
 
@@ -108,7 +110,9 @@ def relative_pose_between(a: Pose, b: Pose) -> RelativePose:
 
 def homogeneous(points: Floats) -> Floats:
     """Homogeneous coordinates (n, 3) of points (n, 2)."""
-    return np.column_stack([points, np.ones(len(points))])
+    out = np.ones((3, len(points)))
+    out[:2] = points.T
+    return out.T
 
 
 def sampson(essential: Floats, a: Floats, b: Floats, sigma_a: float, sigma_b: float) -> Floats:
@@ -116,18 +120,20 @@ def sampson(essential: Floats, a: Floats, b: Floats, sigma_a: float, sigma_b: fl
 
     Hartley and Zisserman, Multiple View Geometry, sec. 11.4.3. essential: (3, 3), ``s_bᵀ E s_a = 0``.
     """
-    ha, hb = homogeneous(a), homogeneous(b)
-    line_b, line_a = ha @ essential.T, hb @ essential
-    variance = sigma_b**2 * (line_b[:, :2] ** 2).sum(axis=1) + sigma_a**2 * (line_a[:, :2] ** 2).sum(axis=1)
-    return np.asarray((hb * line_b).sum(axis=1) / np.sqrt(np.maximum(variance, 1e-30)))
+    line_b = essential[:, :2] @ a.T + essential[:, 2:]
+    line_a = essential[:2, :2].T @ b.T + essential[2, :2, None]
+    variance = sigma_b**2 * np.einsum("in,in->n", line_b[:2], line_b[:2])
+    variance += sigma_a**2 * np.einsum("in,in->n", line_a, line_a)
+    algebraic = np.einsum("in,in->n", b.T, line_b[:2]) + line_b[2]
+    return np.asarray(algebraic / np.sqrt(np.maximum(variance, 1e-30)))
 
 
 def triangulate_midpoint(pose: RelativePose, a: Floats, b: Floats) -> tuple[Floats, Floats]:
     """Depths (n,) along the rays of a and of b, in units of the baseline, by least squares; NaN for parallel rays."""
-    ray_a, ray_b = homogeneous(a) @ pose.rotation.T, homogeneous(b)
+    ray_a, ray_b = pose.rotation @ homogeneous(a).T, homogeneous(b).T
     # baseline * direction = s_b ray_b - s_a ray_a
-    aa, bb, ab = (ray_a**2).sum(1), (ray_b**2).sum(1), (ray_a * ray_b).sum(1)
-    at, bt = ray_a @ pose.direction, ray_b @ pose.direction
+    aa, bb, ab = (np.einsum("in,in->n", one, other) for one, other in ((ray_a, ray_a), (ray_b, ray_b), (ray_a, ray_b)))
+    at, bt = pose.direction @ ray_a, pose.direction @ ray_b
     determinant = aa * bb - ab * ab
     determinant = np.where(determinant > 1e-14 * aa * bb, determinant, np.nan)
     return (ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant
@@ -146,9 +152,9 @@ def parallax(pose: TwoViewGeometry, a: Floats, b: Floats) -> float:
     """Median parallax angle [rad] of normalised points a, b (n, 2); 0 without intrinsics."""
     if isinstance(pose, FundamentalMatrix) or len(a) == 0:
         return 0.0
-    rays_a, rays_b = homogeneous(a) @ pose.rotation.T, homogeneous(b)
-    cosine = (rays_a * rays_b).sum(1) / np.linalg.norm(rays_a, axis=1) / np.linalg.norm(rays_b, axis=1)
-    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    ray_a, ray_b = pose.rotation @ homogeneous(a).T, homogeneous(b).T
+    aa, bb, ab = (np.einsum("in,in->n", one, other) for one, other in ((ray_a, ray_a), (ray_b, ray_b), (ray_a, ray_b)))
+    return math.acos(max(-1.0, min(1.0, median(ab / np.sqrt(aa * bb)))))
 
 
 def decompose_essential(essential: Floats, a: Floats, b: Floats) -> RelativePose:
@@ -196,7 +202,7 @@ def homography_residual(a: Floats, b: Floats) -> float:
         image = mapped[:2] / depth
         distance = np.hypot(image[0] - x, image[1] - y)
         # The algebraic error grows with the depth; division by it makes rows count by image distance.
-        weight = 1.0 / np.abs(depth) / (1.0 + (distance / max(3.0 * float(np.median(distance)), 1e-12)) ** 2)
+        weight = 1.0 / np.abs(depth) / (1.0 + (distance / max(3.0 * median(distance), 1e-12)) ** 2)
         weight /= weight.max()
     # Jacobian (2, 2, n) of the homography at each point, in units of b over units of a.
     slope = (homography[:2, :2, None] - image[:, None] * homography[2, :2, None]) / depth
@@ -208,7 +214,7 @@ def homography_residual(a: Floats, b: Floats) -> float:
     # J^T applied to the error rotated by a right angle: the adjugate of J J^T.
     along = slope[0] * error[1] - slope[1] * error[0]
     squared = 2.0 * (np.square(error).sum(axis=0) + np.square(along).sum(axis=0)) / determinant
-    return float(np.median(np.sqrt(np.maximum(squared, 0.0)))) / 1.1774 / float(scale_b[0, 0])
+    return median(np.sqrt(np.maximum(squared, 0.0))) / 1.1774 / float(scale_b[0, 0])
 
 
 def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 300) -> list[RelativePose]:
