@@ -13,6 +13,7 @@ from hub.trajectory.image_tracks import SmoothTrack
 from hub.two_view import relative_pose
 from hub.two_view.refinement import PointPairs, RefinementResult
 from hub.two_view.relative_pose import TwoViewGeometry
+from protocols.geometry import kernels
 from protocols.geometry.order_statistics import median
 from protocols.geometry.types import Bools, Floats, Ints
 
@@ -72,11 +73,16 @@ class Samples:
         self.centre = median(self.time) if self.count else 0.0
         self.centred_time = self.time - self.centre
         self.points = np.asfortranarray(self.points)  # numpy is slow along axes of length two
+        self.compiled: kernels.SampledTracks | None = None
+        if kernels.AVAILABLE and self.count:
+            rows = np.bincount(self.label, minlength=len(self.b)).tolist()
+            splines = [(track.basis.table, track.polynomials) for track in self.b]
+            self.compiled = kernels.SampledTracks(self.points, self.centred_time, rows, splines)
 
     def _moving_rows(self, a: SmoothTrack, b: SmoothTrack, offset: float) -> Ints:
         margin = 0.5
         inside = (a.time - offset > b.basis.begin - margin) & (a.time - offset < b.basis.end + margin)
-        speed = np.hypot(*a.at(a.time, 1).T) * a.focal
+        speed = np.hypot(*a.point_and_velocity(a.time)[1].T) * a.focal
         return np.flatnonzero(inside & (speed > 0.5 * self.settings.min_speed_px))
 
     def interpolate_b(self, time: Floats) -> tuple[Floats, Floats]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hub.trajectory.banded import solve_banded
+from protocols.geometry import kernels
 from protocols.geometry.types import Bools, Floats, Ints
 
 SUPPORT = 4
@@ -34,10 +35,14 @@ class SplineBasis:
     """(s,) knot interval of each stretch [s]: ``spacing``, or slightly less where a stretch is covered exactly."""
     offsets: Ints = field(init=False)
     """(s,) index of each stretch's first control point."""
+    table: Floats = field(init=False)
+    """(4, s) starts, widths, intervals and offsets, for the compiled kernels."""
 
     def __post_init__(self) -> None:
         each = self.intervals + 3
         object.__setattr__(self, "offsets", np.cumsum(each) - each)
+        table = np.array([self.starts, self.widths, self.intervals, self.offsets], dtype=np.float64)
+        object.__setattr__(self, "table", table)
 
     @classmethod
     def covering(cls, begins: Floats, ends: Floats, spacing: float) -> SplineBasis:
@@ -107,6 +112,9 @@ class SplineBasis:
 
         derivative: 0 value, 1 first, 2 second derivative by time.
         """
+        if kernels.AVAILABLE and derivative < 2 and len(self.starts):
+            index, weights, slopes, inside = kernels.spline_weights(self.table, time, 0.0, derivative == 1)
+            return index, (slopes if derivative else weights).T, inside
         index, u, inside, width = self.locate(time)
         weights = basis_weights(u, derivative)
         if derivative:
@@ -118,6 +126,9 @@ class SplineBasis:
 
         extrapolation: as in `locate`.
         """
+        if kernels.AVAILABLE and len(self.starts):
+            index, weights, slopes, inside = kernels.spline_weights(self.table, time, extrapolation, True)
+            return index, weights.T, slopes.T, inside
         index, u, inside, width = self.locate(time, extrapolation)
         return index, basis_weights(u), basis_weights(u, 1) / width[:, None], inside
 
@@ -137,6 +148,9 @@ class SplineBasis:
 
     def evaluate_with_derivatives(self, polynomials: Floats, time: Floats) -> tuple[Floats, Floats]:
         """Values and first derivatives, (n, d) each, at ``time``, of a spline's `polynomials`; NaN outside."""
+        if kernels.AVAILABLE and len(self.starts):
+            values, slopes = kernels.spline_values(self.table, time, polynomials)
+            return values.T, slopes.T
         index, u, inside, width = self.locate(time)
         constant, first, second, third = polynomials.take(index, axis=2)
         slopes = third * u  # Horner's scheme for both, in place
@@ -190,6 +204,8 @@ def basis_weights(u: Floats, derivative: int = 0) -> Floats:
 
 def weighted_sums(control: Floats, index: Ints, weights: Floats) -> Floats:
     """Sums (n, d) of four control points from ``index`` (n,) on, of ``control`` (size, d), with ``weights`` (n, 4)."""
+    if kernels.AVAILABLE:
+        return kernels.weighted_sums(control, index, weights.T).T
     out = np.empty((control.shape[1], len(index)))
     # One coordinate at a time: numpy is slow along axes of length two or three.
     for values, column in zip(out, np.ascontiguousarray(control.T), strict=True):
@@ -217,20 +233,23 @@ def fit_spline(
     stiffness: weight of squared third differences relative to one row; it only bridges empty intervals.
     """
     index, weights, inside = rows
-    used = np.where(inside, row_weight, 0.0)
-    bands = normal_bands(index, weights, used, basis.size)
+    used, size = np.where(inside, row_weight, 0.0), basis.size
+    if kernels.AVAILABLE:
+        bands, target = kernels.spline_normal((index, weights.T), used, values, basis.table, stiffness, size)
+        return solve_banded(bands, target.T)
+    bands = normal_bands(index, weights, used, size)
     intervals = basis.interval_starts()
     third = (-1.0, 3.0, -3.0, 1.0)
     for a in range(SUPPORT):
         for b in range(a, SUPPORT):
             bands[SUPPORT - 1 - (b - a), intervals + b] += stiffness * third[a] * third[b]
     bands[-1] += 1e-12
-    target = np.zeros((basis.size, values.shape[1]))
+    right = np.zeros((size, values.shape[1]))
     for k in range(SUPPORT):
         weighted = used * weights[:, k]
         for d in range(values.shape[1]):
-            target[:, d] += np.bincount(index + k, weighted * values[:, d], minlength=basis.size)
-    return solve_banded(bands, target)
+            right[:, d] += np.bincount(index + k, weighted * values[:, d], minlength=size)
+    return solve_banded(bands, right)
 
 
 def split_at_gaps(time: Floats, max_gap: float, part: Ints | None = None) -> tuple[Floats, Floats]:

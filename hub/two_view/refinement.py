@@ -10,10 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
-from hub.two_view.relative_pose import RelativePose, TwoViewGeometry
+from hub.two_view.relative_pose import TwoViewGeometry
+from protocols.geometry import kernels
 from protocols.geometry.types import Floats
 
 SEARCH_WIDTH = 2.0
@@ -22,6 +25,7 @@ FINAL_WIDTH = 4.0
 """Final width [sigma] of the Cauchy weight in a final fit: 0.996 of the efficiency of least squares."""
 _TOLERANCE = 1e-4
 """Relative decrease of the cost at which it has converged."""
+_NO_INFORMATION = 1e-15  # relative size of eigenvalues that are rounding errors
 _MIN_ROWS = 12  # twice the six unknowns of a relative pose and a lag
 
 
@@ -71,6 +75,14 @@ class RefinementResult:
     normal: Floats
 
 
+def symmetric_inverse(matrix: Floats) -> Floats:
+    """Pseudoinverse of a symmetric matrix (n, n)."""
+    values, vectors = np.linalg.eigh(matrix)
+    size = np.abs(values)
+    known = size > _NO_INFORMATION * size.max()
+    return np.asarray((vectors * np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)) @ vectors.T)
+
+
 def refine(
     sampler: Sampler,
     geometry: TwoViewGeometry,
@@ -90,19 +102,21 @@ def refine(
     final_width: of the Cauchy weight [sigma].
     """
     damping, width = 1e-3, max(3.0 * initial_misfit, final_width)
-    rows = _linearise(sampler, geometry, inverse_rate, intercept, noise, fixed_geometry)
-    if rows is None:
+    system_at = partial(_linearise, sampler, noise=noise, fixed_geometry=fixed_geometry)
+    rows, last_gain = system_at(geometry, inverse_rate, intercept), 0.0
+    system = rows(width)
+    if not np.isfinite(system[2]):
         return None
-    system, last_gain = _normal_equations(rows, inverse_rate, width, noise), 0.0
     for _ in range(iterations):
         normal, gradient, cost = system
-        damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
+        damped = normal.copy()
+        damped.reshape(-1)[:: len(normal) + 1] += damping * normal.diagonal() + 1e-12
         step: Floats = np.asarray(np.linalg.solve(damped, -gradient), dtype=np.float64)
         trial_geometry = geometry if fixed_geometry else geometry.retract(step[:-2])
         trial_map = inverse_rate + float(step[-1]), intercept + float(step[-2])
-        trial_rows = _linearise(sampler, trial_geometry, *trial_map, noise, fixed_geometry)
-        trial = None if trial_rows is None else _normal_equations(trial_rows, trial_map[0], width, noise)
-        if trial_rows is not None and trial is not None and trial[2] < cost:
+        trial_rows = system_at(trial_geometry, *trial_map)
+        trial = trial_rows(width)
+        if trial[2] < cost:
             geometry, (inverse_rate, intercept), rows = trial_geometry, trial_map, trial_rows
             damping = max(damping / 5.0, 1e-9)
             if width == final_width:
@@ -118,10 +132,16 @@ def refine(
                 break
             continue
         width = max(final_width, 0.5 * width)
-        system = _normal_equations(rows, inverse_rate, width, noise)  # another width changes the weights only
+        system = rows(width)  # another width changes the weights only
     if not 0.5 < inverse_rate < 2.0 or width > final_width:
         return None
     return RefinementResult(system[2], inverse_rate, intercept, geometry, system[0])
+
+
+_System: TypeAlias = tuple[Floats, Floats, float]
+"""Normal matrix, gradient and mean robust cost, which is infinite without overlap.
+
+Parameters: the geometry's local ones (none if it is fixed), intercept, inverse rate."""
 
 
 def _linearise(
@@ -129,18 +149,36 @@ def _linearise(
     geometry: TwoViewGeometry,
     inverse_rate: float,
     intercept: float,
+    *,
     noise: NoiseModel,
     fixed_geometry: bool,
-) -> tuple[Floats, Floats] | None:
-    """Residuals (n,) in units of the noise and their Jacobian (k + 2, n); None without overlap.
+) -> Callable[[float], _System]:
+    """The system at a state, by the width of the Cauchy weights."""
+    tangents = np.zeros((0, 3, 3)) if fixed_geometry else geometry.tangents()
+    compiled: kernels.SampledTracks | None = getattr(sampler, "compiled", None)
+    prior = 1.0 / noise.rate_prior_std**2
+    rows = None if compiled else _residuals(sampler(inverse_rate, intercept), geometry.matrix, tangents, noise)
+    time_map, sigma = (inverse_rate, intercept), (noise.sigma_a, noise.sigma_b)
 
-    Parameters: the geometry's local ones (none if it is fixed), intercept, inverse rate.
-    """
-    pairs = sampler(inverse_rate, intercept)
-    count = len(pairs.a)
-    if count < _MIN_ROWS:
-        return None
-    matrix, a, b = geometry.matrix, pairs.a.T, pairs.b.T
+    def system(width: float) -> _System:
+        if compiled is None:
+            count, normal, gradient, cost = _normal_equations(rows, len(tangents) + 2, width)
+        else:
+            count, normal, gradient, cost = kernels.sampson_system(
+                compiled, time_map, geometry.matrix, tangents, sigma, width
+            )
+        if count < _MIN_ROWS:
+            return normal, gradient, np.inf
+        normal[-1, -1] += prior
+        gradient[-1] += prior * (inverse_rate - 1.0)
+        return normal, gradient, (cost + prior * (inverse_rate - 1.0) ** 2) / count
+
+    return system
+
+
+def _residuals(pairs: PointPairs, matrix: Floats, tangents: Floats, noise: NoiseModel) -> tuple[Floats, Floats]:
+    """Sampson distances (n,) in units of the noise and their Jacobian (k + 2, n)."""
+    a, b = pairs.a.T, pairs.b.T
     line_b = matrix[:, :2] @ a
     line_b += matrix[:, 2:]
     line_a = matrix[:2, :2].T @ b
@@ -152,31 +190,21 @@ def _linearise(
     residual = np.einsum("in,in->n", b, line_b[:2])
     residual += line_b[2]
     residual *= over
-    free = 0 if fixed_geometry else 5 if isinstance(geometry, RelativePose) else 7
-    jacobian = np.empty((free + 2, count))
-    if free:
-        products = np.empty((3, 3, count))
-        np.multiply(b[:, None], a, out=products[:2, :2])
-        products[2, :2], products[:2, 2], products[2, 2] = a, b, 1.0
-        np.matmul(geometry.tangents().reshape(free, 9), products.reshape(9, count), out=jacobian[:free])
+    count, free = len(residual), len(tangents)
+    jacobian, products = np.empty((free + 2, count)), np.empty((3, 3, count))
+    np.multiply(b[:, None], a, out=products[:2, :2])
+    products[2, :2], products[:2, 2], products[2, 2] = a, b, 1.0
+    np.matmul(tangents.reshape(free, 9), products.reshape(9, count), out=jacobian[:free])
     np.einsum("in,in->n", line_b[:2], pairs.velocity_b.T, out=jacobian[free])
     np.multiply(jacobian[free], pairs.centred_time, out=jacobian[free + 1])
     jacobian *= over
     return residual, jacobian
 
 
-def _normal_equations(
-    rows: tuple[Floats, Floats], inverse_rate: float, width: float, noise: NoiseModel
-) -> tuple[Floats, Floats, float]:
-    """Normal matrix, gradient and mean robust cost of `_linearise`'s rows, with Cauchy weights of a width."""
-    residual, jacobian = rows
-    ratio = residual / width
-    ratio *= ratio
+def _normal_equations(rows: tuple[Floats, Floats] | None, size: int, width: float) -> tuple[int, Floats, Floats, float]:
+    """Number of rows, normal matrix, gradient and robust cost of `_residuals`, with Cauchy weights of a width."""
+    residual, jacobian = rows or (np.zeros(0), np.zeros((size, 0)))
+    ratio = np.square(residual / width)
     weighted = jacobian / (1.0 + ratio)
-    normal = weighted @ jacobian.T
-    gradient = weighted @ residual
-    prior = 1.0 / noise.rate_prior_std**2
-    normal[-1, -1] += prior
-    gradient[-1] += prior * (inverse_rate - 1.0)
-    cost = float((width**2 * np.log1p(ratio)).sum()) + prior * (inverse_rate - 1.0) ** 2
-    return normal, gradient, cost / len(residual)
+    cost = float((width**2 * np.log1p(ratio)).sum())
+    return len(residual), weighted @ jacobian.T, weighted @ residual, cost

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from hub.two_view.fundamental import hartley_normalisation
-from protocols.geometry import so3
+from protocols.geometry import kernels, so3
 from protocols.geometry.order_statistics import median
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
@@ -171,6 +171,7 @@ def decompose_essential(essential: Floats, a: Floats, b: Floats) -> RelativePose
 
 _SYMMETRIC_INDEX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Index of each entry of a symmetric 3x3 matrix among its six upper ones."""
+_REWEIGHTINGS = 4  # of a homography: outliers have lost their weight by then
 
 
 def homography_residual(a: Floats, b: Floats) -> float:
@@ -183,13 +184,15 @@ def homography_residual(a: Floats, b: Floats) -> float:
     """
     if len(a) < 8:
         return float("nan")
+    if kernels.AVAILABLE:
+        return kernels.homography_residual(a, b, _REWEIGHTINGS) / 1.1774
     scale_a, scale_b = hartley_normalisation(a), hartley_normalisation(b)
     # Coordinates first, points last: numpy is slow along axes of length two or three.
     ha, (x, y, _) = scale_a @ homogeneous(a).T, scale_b @ homogeneous(b).T
     outer = ha[[0, 0, 0, 1, 1, 2]] * ha[[0, 1, 2, 1, 2, 2]]
     of_b = np.stack([np.ones_like(x), -x, -y, x * x + y * y], axis=1)
     weight, normal = np.ones(len(a)), np.zeros((9, 9))
-    for _ in range(4):
+    for _ in range(_REWEIGHTINGS):
         # Normal matrix of the DLT rows (ha, 0, -x ha) and (0, ha, -y ha).
         plain, by_x, by_y, by_both = (outer @ (of_b * np.square(weight)[:, None])).T[:, _SYMMETRIC_INDEX]
         normal[:3, :3] = normal[3:6, 3:6] = plain
