@@ -17,6 +17,7 @@ from hub.trajectory.banded import cho_solve_banded, cholesky_banded, solve_upper
 from hub.trajectory.compiled import csc_matvecs
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT, SplineBasis
+from protocols.geometry import kernels
 from protocols.geometry.types import Floats, Ints
 
 _ROWS_AT_ONCE = 1001  # products of so many fit a core's cache; no power of two, whose columns displace each other there
@@ -58,6 +59,9 @@ class PathBlocks:
         """
         others = terms.shape[1] - 3
         crossed, gram = np.zeros((self.size + SUPPORT, 3 * others)), np.zeros((others, others))
+        if kernels.AVAILABLE and others <= kernels.MOST_TERMS:
+            kernels.add_rows(index, weights.T, terms, self._sums, crossed, gram)
+            return crossed.reshape(-1, others)[: 3 * self.size], gram
         for first in range(0, len(index), _ROWS_AT_ONCE):
             rows = slice(first, first + _ROWS_AT_ONCE)
             u, v = terms[:, :, rows]

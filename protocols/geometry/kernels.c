@@ -12,6 +12,15 @@ typedef int64_t integer;
 
 #define SIXTH (1.0 / 6.0)
 
+/* On processors with wider registers a loop takes fewer operations, with the same result. */
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && defined(__linux__)
+#define WIDE __attribute__((target_clones("avx2", "default")))
+#define INLINE inline __attribute__((always_inline))
+#else
+#define WIDE
+#define INLINE inline
+#endif
+
 /* hub.trajectory.splines.SplineBasis.locate for one time; 0 outside. basis: (4, stretches) starts, widths, intervals,
    first control points. hint: the stretch of the time before. */
 static int locate(const double *basis, integer stretches, double time, double extrapolation, integer *hint,
@@ -117,6 +126,55 @@ void spline_normal(integer n, const integer *index, const double *weights, const
     for (integer j = 0; j < size; j++) bands[3 * size + j] += 1e-12;
 }
 
+/* hub.bundle.bordered_system.PathBlocks.add_rows: weights (4, n), terms (2, 3 + p, n), p at most 21; added to sums
+   ((size + 4) * 10, 6), to crossed (size + 4, 3, p) and to gram (p, p). */
+WIDE void add_rows(integer n, const integer *index, const double *weights, integer p, const double *terms,
+                   double *sums, double *crossed, double *gram)
+{
+    enum { MOST = 24 };
+    const integer width = 3 + p;
+    for (integer i = 0; i < n; i++) {
+        double u[MOST], v[MOST], products[3][MOST];
+        for (integer c = 0; c < width; c++) {
+            u[c] = terms[c * n + i];
+            v[c] = terms[(width + c) * n + i];
+        }
+        for (int r = 0; r < 3; r++)
+            for (integer c = 0; c < width; c++) products[r][c] = u[r] * u[c] + v[r] * v[c];
+        double upper[6] = {products[0][0], products[0][1], products[0][2], products[1][1], products[1][2], products[2][2]};
+        double *of_pair = sums + 60 * index[i];
+        for (int a = 0; a < 4; a++) {
+            double weight = weights[a * n + i], *to = crossed + (index[i] + a) * 3 * p;
+            for (int r = 0; r < 3; r++)
+                for (integer c = 0; c < p; c++) to[r * p + c] += weight * products[r][3 + c];
+            for (int b = a; b < 4; b++, of_pair += 6) {
+                double both = weight * weights[b * n + i];
+                for (int k = 0; k < 6; k++) of_pair[k] += both * upper[k];
+            }
+        }
+        for (integer r = 0; r < p; r++)
+            for (integer c = 0; c < p; c++) gram[r * p + c] += u[3 + r] * u[3 + c] + v[3 + r] * v[3 + c];
+    }
+}
+
+/* Intrinsics.distort: normalised (2, n), coefficients k1, k2, p1, p2, k3; out (2, n), jacobian (2, 2, n). */
+WIDE void brown_distortion(integer n, const double *normalised, const double *coefficients, double *out,
+                           double *jacobian)
+{
+    const double k1 = coefficients[0], k2 = coefficients[1], p1 = coefficients[2], p2 = coefficients[3];
+    const double k3 = coefficients[4];
+    for (integer i = 0; i < n; i++) {
+        double x = normalised[i], y = normalised[n + i], r2 = x * x + y * y;
+        double radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), slope = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2);
+        double mixed = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y;
+        out[i] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
+        out[n + i] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
+        jacobian[i] = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x;
+        jacobian[n + i] = jacobian[2 * n + i] = mixed;
+        jacobian[3 * n + i] = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x;
+    }
+}
+
 /* The tracks of one camera, a label each. rows: where each label's rows end. */
 typedef struct {
     integer labels;
@@ -206,14 +264,6 @@ integer sampson_system(integer n, const double *points, const double *centred_ti
     return count;
 }
 
-/* On processors with wider registers eight lanes are two operations, with the same result. */
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && defined(__linux__)
-#define WIDE __attribute__((target_clones("avx2", "default")))
-#define INLINE inline __attribute__((always_inline))
-#else
-#define WIDE
-#define INLINE inline
-#endif
 #define LANES 8
 #define FOR_LANES for (int lane = 0; lane < LANES; lane++)
 typedef double lanes[LANES];

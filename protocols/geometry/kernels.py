@@ -21,6 +21,8 @@ _SIGNATURES = {
     "spline_values": "npnpnnppp",
     "weighted_sums": "nnpppp",
     "spline_normal": "npppnpnpdnpp",
+    "add_rows": "nppnpppp",
+    "brown_distortion": "npppp",
     "sampson_system": "npppddppndddppp",
     "smallest_eigenvalues": "npddndp",
     "neighbour_scores": "nppnpndp",
@@ -113,6 +115,26 @@ def spline_normal(
     given = _at(index), _at(weights), _at(row_weight), width, _at(values), basis.shape[1], _at(basis)
     _library().spline_normal(len(index), *given, stiffness, size, _at(bands), _at(target))
     return bands, target
+
+
+MOST_TERMS = 21
+"""Columns beside the point's that `add_rows` takes: the parameters of a camera and the residual."""
+
+
+def add_rows(index: Ints, weights: Floats, terms: Floats, sums: Floats, crossed: Floats, gram: Floats) -> None:
+    """Add rows to the sums of `hub.bundle.bordered_system.PathBlocks`. weights: (4, n). terms: (2, 3 + p, n)."""
+    index, weights = np.ascontiguousarray(index, dtype=np.int64), np.ascontiguousarray(weights)
+    terms, width = np.ascontiguousarray(terms), terms.shape[1] - 3
+    to = _at(sums), _at(crossed), _at(gram)
+    _library().add_rows(len(index), _at(index), _at(weights), width, _at(terms), *to)
+
+
+def brown_distortion(normalised: Floats, coefficients: Floats) -> tuple[Floats, Floats]:
+    """Distorted coordinates (2, n) of normalised ones (n, 2), and their Jacobian (2, 2, n)."""
+    normalised, coefficients = _rows_last(normalised), np.ascontiguousarray(coefficients, dtype=np.float64)
+    out, jacobian = np.empty(normalised.shape), np.empty((2, *normalised.shape))
+    _library().brown_distortion(normalised.shape[1], _at(normalised), _at(coefficients), _at(out), _at(jacobian))
+    return out, jacobian
 
 
 class SampledTracks:
