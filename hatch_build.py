@@ -12,7 +12,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 # No fused operations: the same numbers on every machine.
-_FLAGS = ("-O3", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno")
+FLAGS = ("-O3", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno")
 
 
 class KernelsBuildHook(BuildHookInterface[Any]):
@@ -25,7 +25,7 @@ class KernelsBuildHook(BuildHookInterface[Any]):
         compiler = shutil.which(os.environ.get("CC", "cc"))
         if self.target_name != "wheel" or compiler is None or os.environ.get("SYNCLINE_PURE"):
             return
-        command = [compiler, *_FLAGS, "-o", str(library), str(source), "-lm"]
+        command = [compiler, *FLAGS, "-o", str(library), str(source), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             self.app.display_warning(f"kernels not compiled, numpy is used: {done.stderr.strip()[-500:]}")
