@@ -32,10 +32,10 @@ from hub.bundle.problem import (
 )
 from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
-from hub.trajectory.compiled import chdtri
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.compiled import chdtri
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.calibration import AdjustmentStep

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hub.trajectory.banded import cho_solve_banded, cholesky_banded, solve_upper_transposed
-from hub.trajectory.compiled import csc_matvecs
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT, SplineBasis
 from protocols.geometry import kernels
+from protocols.geometry.compiled import csc_matvecs
 from protocols.geometry.types import Floats, Ints
 
 _ROWS_AT_ONCE = 1001  # products of so many fit a core's cache; no power of two, whose columns displace each other there

@@ -11,9 +11,9 @@ from hub.bundle.bordered_system import BAND, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
-from hub.trajectory.compiled import csr_matvecs, erf
 from hub.trajectory.splines import SUPPORT
 from protocols.geometry import so3
+from protocols.geometry.compiled import csr_matvecs, erf
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 

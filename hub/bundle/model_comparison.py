@@ -36,7 +36,7 @@ from hub.bundle.problem import (
 from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.banded import cho_solve_banded
-from hub.trajectory.compiled import chdtri
+from protocols.geometry.compiled import chdtri
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.rig import MAX_READOUT_S
 

@@ -23,8 +23,8 @@ from hub.sync.lag_scan import (
     taubin_normalisation,
     to_grid_coordinates,
 )
-from hub.trajectory.compiled import chdtri, gammainc, gammaln
 from hub.trajectory.image_tracks import SmoothTrack
+from protocols.geometry.compiled import chdtri, gammainc, gammaln
 from protocols.geometry.order_statistics import median, quantile
 from protocols.geometry.types import Floats, Ints
 

@@ -73,11 +73,16 @@ class Samples:
         self.centre = median(self.time) if self.count else 0.0
         self.centred_time = self.time - self.centre
         self.points = np.asfortranarray(self.points)  # numpy is slow along axes of length two
-        self.compiled: kernels.SampledTracks | None = None
-        if kernels.AVAILABLE and self.count:
+        self._compiled: kernels.SampledTracks | None = None
+
+    @property
+    def compiled(self) -> kernels.SampledTracks | None:
+        """The samples for the compiled kernels."""
+        if self._compiled is None and kernels.AVAILABLE and self.count:
             rows = np.bincount(self.label, minlength=len(self.b)).tolist()
             splines = [(track.basis.table, track.polynomials) for track in self.b]
-            self.compiled = kernels.SampledTracks(self.points, self.centred_time, rows, splines)
+            self._compiled = kernels.SampledTracks(self.points, self.centred_time, rows, splines)
+        return self._compiled
 
     def _moving_rows(self, a: SmoothTrack, b: SmoothTrack, offset: float) -> Ints:
         margin = 0.5

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hub.trajectory.compiled import dpbsv, dpbtrf, dpbtrs, dptsv, dtbtrs
+from protocols.geometry.compiled import dpbsv, dpbtrf, dpbtrs, dptsv, dtbtrs
 from protocols.geometry.types import Floats
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from hub.two_view.relative_pose import TwoViewGeometry
 from protocols.geometry import kernels
+from protocols.geometry.compiled import dgesv
 from protocols.geometry.types import Floats
 
 SEARCH_WIDTH = 2.0
@@ -111,7 +112,7 @@ def refine(
         normal, gradient, cost = system
         damped = normal.copy()
         damped.reshape(-1)[:: len(normal) + 1] += damping * normal.diagonal() + 1e-12
-        step: Floats = np.asarray(np.linalg.solve(damped, -gradient), dtype=np.float64)
+        step: Floats = np.asarray(dgesv(damped, -gradient)[2])  # numpy's solution, without its checks
         trial_geometry = geometry if fixed_geometry else geometry.retract(step[:-2])
         trial_map = inverse_rate + float(step[-1]), intercept + float(step[-2])
         trial_rows = system_at(trial_geometry, *trial_map)
@@ -157,16 +158,15 @@ def _linearise(
     tangents = np.zeros((0, 3, 3)) if fixed_geometry else geometry.tangents()
     compiled: kernels.SampledTracks | None = getattr(sampler, "compiled", None)
     prior = 1.0 / noise.rate_prior_std**2
-    rows = None if compiled else _residuals(sampler(inverse_rate, intercept), geometry.matrix, tangents, noise)
+    matrix = geometry.matrix
+    rows = None if compiled else _residuals(sampler(inverse_rate, intercept), matrix, tangents, noise)
     time_map, sigma = (inverse_rate, intercept), (noise.sigma_a, noise.sigma_b)
 
     def system(width: float) -> _System:
         if compiled is None:
             count, normal, gradient, cost = _normal_equations(rows, len(tangents) + 2, width)
         else:
-            count, normal, gradient, cost = kernels.sampson_system(
-                compiled, time_map, geometry.matrix, tangents, sigma, width
-            )
+            count, normal, gradient, cost = kernels.sampson_system(compiled, time_map, matrix, tangents, sigma, width)
         if count < _MIN_ROWS:
             return normal, gradient, np.inf
         normal[-1, -1] += prior

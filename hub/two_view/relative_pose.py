@@ -165,8 +165,14 @@ def decompose_essential(essential: Floats, a: Floats, b: Floats) -> RelativePose
     u, _, vt = np.linalg.svd(essential)
     u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    options = [RelativePose(u @ w @ vt, sign * u[:, 2]) for w in (quarter, quarter.T) for sign in (1.0, -1.0)]
-    return max(options, key=lambda option: int(in_front(option, a, b).sum()))
+    options = list[tuple[int, RelativePose]]()
+    for rotation in (u @ quarter @ vt, u @ quarter.T @ vt):
+        depths = np.stack(triangulate_midpoint(RelativePose(rotation, u[:, 2]), a, b))
+        with np.errstate(invalid="ignore"):
+            for sign in (1.0, -1.0):  # the depths change their sign with the direction
+                count = int(np.count_nonzero((sign * depths > 0).all(axis=0)))
+                options.append((count, RelativePose(rotation, sign * u[:, 2])))
+    return max(options, key=lambda option: option[0])[1]
 
 
 _SYMMETRIC_INDEX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from ctypes import CDLL, byref, c_double, c_int64, c_void_p
+from ctypes import CDLL, addressof, byref, c_char, c_double, c_int64, c_void_p
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +56,10 @@ def _library() -> CDLL:
 
 def _at(array: Floats | Ints | Bools) -> int:
     """The address of an array, which is contiguous and outlives the call."""
-    address: int = array.__array_interface__["data"][0]
-    return address
+    try:
+        return addressof(c_char.from_buffer(array))  # type: ignore[arg-type]  # a third of the time of numpy's own
+    except (TypeError, ValueError):  # read-only or empty
+        return array.ctypes.data
 
 
 def _rows_last(points: Floats) -> Floats:
@@ -172,14 +174,16 @@ def sampson_system(
     sigma: noise of a and of b.
     """
     free, (rate, intercept) = len(tangents), time_map
-    normal, gradient, cost = np.empty((free + 2, free + 2)), np.empty(free + 2), c_double()
+    size, cost = free + 2, c_double()
+    both = np.empty((size + 1, size))
     matrix, tangents = np.ascontiguousarray(matrix), np.ascontiguousarray(tangents)
-    out = _at(normal), _at(gradient), byref(cost)
+    to = _at(both)
+    out = to, to + both.itemsize * size * size, byref(cost)
     variances = sigma[0] ** 2, sigma[1] ** 2
     count: int = _library().sampson_system(
         samples.count, *samples.at, rate, intercept, _at(matrix), _at(tangents), free, *variances, width, *out
     )
-    return count, normal, gradient, cost.value
+    return count, both[:-1], both[-1], cost.value
 
 
 def smallest_eigenvalues(

@@ -35,7 +35,7 @@ def test_calibrate_does_not_load_what_scipy_imports_in_vain() -> None:
         "import sys; from deploy.commands.offline.calibrate import UNUSED, defer_modules;"
         "[defer_modules(*one) for one in UNUSED.items()]; import hub.calibration.pipeline, numpy, scipy;"
         "print(*sys.modules); print(numpy.ma.array([1]).sum(), int(scipy.linalg.det([[1.0]])));"
-        "from scipy.special import chdtri; from hub.trajectory import compiled; print(chdtri is compiled.chdtri)"
+        "from scipy.special import chdtri; from protocols.geometry import compiled; print(chdtri is compiled.chdtri)"
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     modules, used, same = process.stdout.splitlines()

@@ -15,8 +15,8 @@ from hub.bundle.datum.gauge import (
     fit_to_control_points,
 )
 from hub.bundle.problem import CAMERA_PARAMETERS
-from hub.trajectory.compiled import chdtri, fdtri
 from protocols.geometry import so3
+from protocols.geometry.compiled import chdtri, fdtri
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig

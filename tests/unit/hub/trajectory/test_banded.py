@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hub.trajectory import banded, compiled
+from hub.trajectory import banded
+from protocols.geometry import compiled
 from protocols.geometry.types import Floats
 
 _SIZE, _BANDS = 40, 4  # of a matrix like that of a spline

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 try:
-    from scipy.linalg._flapack import dpbsv, dpbtrf, dpbtrs, dptsv, dtbtrs
+    from scipy.linalg._flapack import dgesv, dpbsv, dpbtrf, dpbtrs, dptsv, dtbtrs
     from scipy.sparse._sparsetools import csc_matvecs, csr_matvecs
     from scipy.special._ufuncs import chdtri, erf, fdtri, gammainc, gammaln
 except ImportError:  # another version of scipy
-    from scipy.linalg.lapack import dpbsv, dpbtrf, dpbtrs, dptsv, dtbtrs
+    from scipy.linalg.lapack import dgesv, dpbsv, dpbtrf, dpbtrs, dptsv, dtbtrs
     from scipy.sparse import csc_array, csr_array
     from scipy.special import chdtri, erf, fdtri, gammainc, gammaln
 
@@ -26,6 +26,7 @@ __all__ = [
     "chdtri",
     "csc_matvecs",
     "csr_matvecs",
+    "dgesv",
     "dpbsv",
     "dpbtrf",
     "dpbtrs",
