@@ -152,9 +152,12 @@ def rotation_bound(pairs: PointPairs, matrix: Floats, noise: NoiseModel) -> floa
     residual = sampson(matrix, pairs.a, pairs.b, noise.sigma_a, noise.sigma_b)
     weight = 1.0 / (1.0 + (residual / FINAL_WIDTH) ** 2)
     rows = (np.concatenate([b, pairs.velocity_b.T])[:, None] * a).reshape(-1, len(residual))
-    moments, in_image = (weight * rows) @ rows.T, np.diag([1.0, 1.0, 0.0])
-    norm = noise.sigma_b**2 * np.kron(in_image, (weight * a) @ a.T)
-    norm += noise.sigma_a**2 * np.kron((weight * b) @ b.T, in_image)
+    moments, blocks = (weight * rows) @ rows.T, np.zeros((3, 3, 3, 3))
+    of_a, of_b = noise.sigma_b**2 * ((weight * a) @ a.T), noise.sigma_a**2 * ((weight * b) @ b.T)
+    for k in range(2):  # the coordinates in the image are noisy, the third is not
+        blocks[k, :, k] += of_a
+        blocks[:, k, :, k] += of_b
+    norm = blocks.reshape(9, 9)
     start = matrix.ravel() / np.linalg.norm(matrix)
     cost = start @ moments[:9, :9] @ start / (start @ norm @ start)
     limit = cost + LIKELIHOOD_MARGIN * (2.0 * float(autocorrelation(residual).sum()) - 1.0) / len(residual)

@@ -197,11 +197,11 @@ class PairMoments:
         """Mean squared distance over the squared noise (m,) under a given ``m_aᵀ F m_b = 0`` at lags ``which``."""
         theta = to_grid_coordinates(matrix, self.a, self.b).reshape(3, 3)
         plane = np.diag([1.0, 1.0, 0.0])
-        misfit = np.zeros((len(_MONOMIALS), len(_MONOMIALS)))
-        np.add.at(misfit, (_MONOMIAL_OF_A, _MONOMIAL_OF_B), np.outer(theta, theta))
-        of_a, of_b = np.zeros(len(_MONOMIALS)), np.zeros(len(_MONOMIALS))
-        np.add.at(of_b, MONOMIAL_INDEX, self.a.sigma**2 * theta.T @ plane @ theta)
-        np.add.at(of_a, MONOMIAL_INDEX, self.b.sigma**2 * theta @ plane @ theta.T)
+        of_both, each = (len(_MONOMIALS) * _MONOMIAL_OF_A + _MONOMIAL_OF_B).ravel(), MONOMIAL_INDEX.ravel()
+        misfit = np.bincount(of_both, np.outer(theta, theta).ravel(), len(_MONOMIALS) ** 2)
+        misfit = misfit.reshape(len(_MONOMIALS), -1)
+        of_b = np.bincount(each, (self.a.sigma**2 * theta.T @ plane @ theta).ravel())
+        of_a = np.bincount(each, (self.b.sigma**2 * theta @ plane @ theta.T).ravel())
         chosen = self.moment_sums(which)
         noise = of_b @ chosen[5] + of_a @ chosen[:, 5]
         total = np.maximum(chosen[5, 5], 1e-9)

@@ -40,6 +40,8 @@ class Samples:
         # The same fraction of every label, spread over its time.
         thinned = [
             rows[np.linspace(0, len(rows) - 1, round(fraction * len(rows))).round().astype(np.int64)]
+            if fraction < 1.0
+            else rows
             for rows in rows_per_label
         ]
         self.label = np.concatenate([np.full(len(rows), k) for k, rows in enumerate(thinned)])
@@ -179,8 +181,9 @@ def autocorrelation(residual: Floats) -> Floats:
 
 def _mean_interval(time: Floats) -> float:
     """Mean interval [s] of a track's times (n,) without pauses; dropped frames lengthen it."""
-    steps = np.diff(time)
-    return float(steps[steps <= _MAX_INTERVAL_RATIO * median(steps)].mean())
+    steps = time[1:] - time[:-1]
+    short = steps[steps <= _MAX_INTERVAL_RATIO * median(steps)]
+    return float(short.sum()) / len(short)
 
 
 def _planar_residual_px(a: Floats, b: Floats) -> float:

@@ -267,7 +267,7 @@ def _robust_fit(
     """Spline fit with iterative outlier rejection, on stretches split at long gaps and discontinuities."""
     inlier = good.copy()
     basis, control, sigma = None, None, np.inf
-    gap, row_weight = max(gap, _BRIDGED_KNOTS * spacing), std**-2.0
+    gap, row_weight = max(gap, _BRIDGED_KNOTS * spacing), 1.0 / (std * std)
     part_index = np.searchsorted(discontinuities, t)
     for step in range(6):
         inlier, begins, ends, counts = _stretches(t, inlier, gap, part_index)
@@ -277,25 +277,26 @@ def _robust_fit(
         basis = SplineBasis.spanning(begins, ends, spacing)
         rows = basis.weights(t)  # once, for the fit and for its residuals
         control = fit_spline(basis, rows, x, np.where(inlier, row_weight, 0.0), stiffness)
-        error = weighted_sums(control, *rows[:2]) - x
-        residual = np.where(rows[2], np.hypot(error[:, 0], error[:, 1]) / std, np.nan)
+        error = weighted_sums(control, *rows[:2]).T - x.T
+        residual = np.hypot(error[0], error[1])
+        residual /= std
+        residual[~rows[2]] = np.inf
         degrees_of_freedom = _degrees_of_freedom(counts, basis.intervals + 3, stiffness)
         n = float(count)
         left = max(n - degrees_of_freedom, 0.02 * n)
         # Median of a Rayleigh variable: 1.1774 sigma.
         sigma = max(_MIN_SIGMA_PX / focal, median(residual[inlier]) / 1.1774 * np.sqrt(n / left))
-        with np.errstate(invalid="ignore"):
-            again = residual < max(_OUTLIER_SIGMAS * sigma * (2.0 if step == 0 else 1.0), _MIN_OUTLIER_PX / focal)
-        if np.array_equal(again, inlier):
+        again = residual < max(_OUTLIER_SIGMAS * sigma * (2.0 if step == 0 else 1.0), _MIN_OUTLIER_PX / focal)
+        if (again == inlier).all():
             break
         inlier = again
     if basis is None or control is None:
         return None
     squared = np.minimum(residual[inlier], _OUTLIER_SIGMAS * sigma) ** 2
-    kept = float(inlier.sum())
-    score = float(squared.mean()) * (kept / max(kept - degrees_of_freedom, 0.02 * kept)) ** 2
+    kept = float(len(squared))
+    score = float(squared.sum()) / kept * (kept / max(kept - degrees_of_freedom, 0.02 * kept)) ** 2
     # A spacing that rejects many points must not win by fitting the rest well.
-    score *= (float(good.sum()) / kept) ** 2
+    score *= (float(np.count_nonzero(good)) / kept) ** 2
     return _SplineFit(score, basis, control, inlier, sigma)
 
 

@@ -44,16 +44,16 @@ class RelativePose:
 
     def tangents(self) -> Floats:
         """(5, 3, 3) derivatives of ``matrix`` by the local parameters of `retract`."""
-        axes, cross = orthogonal_axes(self.direction), so3.hat(self.direction)
         out = np.empty((5, 3, 3))
-        np.matmul(cross, _GENERATORS @ self.rotation, out=out[:3])
-        np.matmul(so3.hat(axes), self.rotation, out=out[3:])
+        np.matmul(so3.hat(self.direction), _GENERATORS @ self.rotation, out=out[:3])
+        for along, axis in zip(out[3:], orthogonal_axes(self.direction), strict=True):
+            np.matmul(so3.hat(axis), self.rotation, out=along)
         return out
 
     def retract(self, step: Floats) -> RelativePose:
         """The pose after a local step (5,): rotation vector [rad], then the direction along its two tangents."""
         direction = self.direction + step[3:5] @ orthogonal_axes(self.direction)
-        return RelativePose(so3.exp(step[:3]) @ self.rotation, direction / np.linalg.norm(direction))
+        return RelativePose(so3.exp(step[:3]) @ self.rotation, direction / math.sqrt(direction @ direction))
 
     def inverse(self) -> RelativePose:
         """The relative pose of a from b."""
@@ -267,10 +267,14 @@ def fundamental_from(pose: TwoViewGeometry, matrix_a: Floats, matrix_b: Floats) 
 
 def orthogonal_axes(direction: Floats) -> Floats:
     """Two unit vectors (2, 3) orthogonal to ``direction`` (3,) and to each other."""
-    x, y, z = (float(value) for value in direction)
+    x, y, z = direction.tolist()
     # Cross product with the coordinate axis least aligned with the direction.
-    least = min(range(3), key=lambda k: abs((x, y, z)[k]))
-    first = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[least]
-    length = (first[0] ** 2 + first[1] ** 2 + first[2] ** 2) ** 0.5
-    p, q, r = (value / length for value in first)
+    if abs(x) <= abs(y) and abs(x) <= abs(z):
+        p, q, r = 0.0, z, -y
+    elif abs(y) <= abs(z):
+        p, q, r = -z, 0.0, x
+    else:
+        p, q, r = y, -x, 0.0
+    length = math.sqrt(p * p + q * q + r * r)
+    p, q, r = p / length, q / length, r / length
     return np.array([[p, q, r], [y * r - z * q, z * p - x * r, x * q - y * p]])
