@@ -118,11 +118,7 @@ class LagScan:
 def fast_length(least: int) -> int:
     """The smallest length of 2, 3 and 5 as factors, no less than ``least``: for the FFT of real numbers."""
     found = 1 << (least - 1).bit_length()
-    odd = list[int]()
-    for power in (3**i for i in range(found.bit_length())):
-        while power < found:
-            odd.append(power)
-            power *= 5
+    odd = [3**i * 5**j for i in range(21) for j in range(15) if 3**i * 5**j < found]
     lengths: list[int] = [part << (-(-least // part) - 1).bit_length() for part in odd]
     return min([found, *lengths])
 

@@ -79,8 +79,7 @@ class RefinementResult:
 def symmetric_inverse(matrix: Floats) -> Floats:
     """Pseudoinverse of a symmetric matrix (n, n)."""
     values, vectors = np.linalg.eigh(matrix)
-    size = np.abs(values)
-    known = size > _NO_INFORMATION * size.max()
+    known = np.abs(values) > _NO_INFORMATION * np.abs(values).max()
     return np.asarray((vectors * np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)) @ vectors.T)
 
 
@@ -140,9 +139,7 @@ def refine(
 
 
 _System: TypeAlias = tuple[Floats, Floats, float]
-"""Normal matrix, gradient and mean robust cost, which is infinite without overlap.
-
-Parameters: the geometry's local ones (none if it is fixed), intercept, inverse rate."""
+"""Normal matrix and gradient by local geometry, intercept, inverse rate; mean robust cost, infinite without overlap."""
 
 
 def _linearise(

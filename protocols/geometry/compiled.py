@@ -4,11 +4,11 @@ from __future__ import annotations
 
 try:
     from scipy.linalg._flapack import dgesv, dpbsv, dpbtrf, dpbtrs, dptsv, dtbtrs
-    from scipy.sparse._sparsetools import csc_matvecs, csr_matvecs
+    from scipy.sparse._sparsetools import csc_matvecs
     from scipy.special._ufuncs import chdtri, erf, fdtri, gammainc, gammaln
 except ImportError:  # another version of scipy
     from scipy.linalg.lapack import dgesv, dpbsv, dpbtrf, dpbtrs, dptsv, dtbtrs
-    from scipy.sparse import csc_array, csr_array
+    from scipy.sparse import csc_array
     from scipy.special import chdtri, erf, fdtri, gammainc, gammaln
 
     def csc_matvecs(rows, columns, vectors, starts, places, weights, values, out) -> None:  # type: ignore[misc, no-untyped-def]
@@ -16,16 +16,10 @@ except ImportError:  # another version of scipy
         matrix = csc_array((weights, places, starts), shape=(rows, columns))
         out += (matrix @ values.reshape(columns, vectors)).ravel()
 
-    def csr_matvecs(rows, columns, vectors, starts, places, weights, values, out) -> None:  # type: ignore[misc, no-untyped-def]
-        """The same of a matrix by rows."""
-        matrix = csr_array((weights, places, starts), shape=(rows, columns))
-        out += (matrix @ values.reshape(columns, vectors)).ravel()
-
 
 __all__ = [
     "chdtri",
     "csc_matvecs",
-    "csr_matvecs",
     "dgesv",
     "dpbsv",
     "dpbtrf",

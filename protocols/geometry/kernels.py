@@ -10,6 +10,7 @@ import os
 from collections.abc import Sequence
 from ctypes import CDLL, addressof, byref, c_char, c_double, c_int64, c_void_p
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -44,14 +45,8 @@ def load(file: Path) -> CDLL | None:
     return library
 
 
-_LIBRARY = None if os.environ.get("SYNCLINE_PURE") else load(Path(__file__).with_name("libkernels.so"))
-AVAILABLE = _LIBRARY is not None
-
-
-def _library() -> CDLL:
-    if _LIBRARY is None:
-        raise RuntimeError("no compiled kernels: ask AVAILABLE first")
-    return _LIBRARY
+_found = None if os.environ.get("SYNCLINE_PURE") else load(Path(__file__).with_name("libkernels.so"))
+AVAILABLE, _library = _found is not None, cast(CDLL, _found)
 
 
 def _at(array: Floats | Ints | Bools) -> int:
@@ -78,7 +73,7 @@ def spline_weights(
     index, inside = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.bool_)
     weights, derivatives = np.empty((4, count)), np.empty((4, count if slopes else 0))
     to = _at(derivatives) if slopes else 0
-    _library().spline_weights(
+    _library.spline_weights(
         count, _at(time), basis.shape[1], _at(basis), extrapolation, _at(index), _at(weights), to, _at(inside)
     )
     return index, weights, derivatives, inside
@@ -88,7 +83,7 @@ def spline_values(basis: Floats, time: Floats, polynomials: Floats) -> tuple[Flo
     """Values and slopes (d, n) at time (n,); NaN outside. polynomials: (4, d, m)."""
     time, (_, width, size) = np.ascontiguousarray(time, dtype=np.float64), polynomials.shape
     values, slopes = np.empty((2, width, len(time)))
-    _library().spline_values(
+    _library.spline_values(
         len(time), _at(time), basis.shape[1], _at(basis), width, size, _at(polynomials), _at(values), _at(slopes)
     )
     return values, slopes
@@ -99,7 +94,7 @@ def weighted_sums(control: Floats, index: Ints, weights: Floats) -> Floats:
     control, weights = np.ascontiguousarray(control, dtype=np.float64), np.ascontiguousarray(weights)
     index = np.ascontiguousarray(index, dtype=np.int64)
     out = np.empty((control.shape[1], len(index)))
-    _library().weighted_sums(len(index), control.shape[1], _at(control), _at(index), _at(weights), _at(out))
+    _library.weighted_sums(len(index), control.shape[1], _at(control), _at(index), _at(weights), _at(out))
     return out
 
 
@@ -115,7 +110,7 @@ def spline_normal(
     width = values.shape[1]
     bands, target = np.zeros((4, size)), np.zeros((width, size))
     given = _at(index), _at(weights), _at(row_weight), width, _at(values), basis.shape[1], _at(basis)
-    _library().spline_normal(len(index), *given, stiffness, size, _at(bands), _at(target))
+    _library.spline_normal(len(index), *given, stiffness, size, _at(bands), _at(target))
     return bands, target
 
 
@@ -128,14 +123,14 @@ def add_rows(index: Ints, weights: Floats, terms: Floats, sums: Floats, crossed:
     index, weights = np.ascontiguousarray(index, dtype=np.int64), np.ascontiguousarray(weights)
     terms, width = np.ascontiguousarray(terms), terms.shape[1] - 3
     to = _at(sums), _at(crossed), _at(gram)
-    _library().add_rows(len(index), _at(index), _at(weights), width, _at(terms), *to)
+    _library.add_rows(len(index), _at(index), _at(weights), width, _at(terms), *to)
 
 
 def brown_distortion(normalised: Floats, coefficients: Floats) -> tuple[Floats, Floats]:
     """Distorted coordinates (2, n) of normalised ones (n, 2), and their Jacobian (2, 2, n)."""
     normalised, coefficients = _rows_last(normalised), np.ascontiguousarray(coefficients, dtype=np.float64)
     out, jacobian = np.empty(normalised.shape), np.empty((2, *normalised.shape))
-    _library().brown_distortion(normalised.shape[1], _at(normalised), _at(coefficients), _at(out), _at(jacobian))
+    _library.brown_distortion(normalised.shape[1], _at(normalised), _at(coefficients), _at(out), _at(jacobian))
     return out, jacobian
 
 
@@ -180,7 +175,7 @@ def sampson_system(
     to = _at(both)
     out = to, to + both.itemsize * size * size, byref(cost)
     variances = sigma[0] ** 2, sigma[1] ** 2
-    count: int = _library().sampson_system(
+    count: int = _library.sampson_system(
         samples.count, *samples.at, rate, intercept, _at(matrix), _at(tangents), free, *variances, width, *out
     )
     return count, both[:-1], both[-1], cost.value
@@ -192,7 +187,7 @@ def smallest_eigenvalues(
     """Smallest generalised eigenvalues (m,) of moments (6, 6, m) under Taubin's normalisation."""
     moments, count = np.ascontiguousarray(moments), moments.shape[2]
     out = np.empty(count)
-    _library().smallest_eigenvalues(count, _at(moments), sigma_a**2, sigma_b**2, iterations, min_orthogonal, _at(out))
+    _library.smallest_eigenvalues(count, _at(moments), sigma_a**2, sigma_b**2, iterations, min_orthogonal, _at(out))
     return out
 
 
@@ -200,9 +195,7 @@ def neighbour_scores(time: Floats, points: Floats, rows: Ints, one_sided: bool, 
     """Quantile ``share`` (n,) of each point's distances from lines through two of the good ones ``rows``."""
     time, points = np.ascontiguousarray(time), np.ascontiguousarray(points)
     out = np.empty(len(time))
-    _library().neighbour_scores(
-        len(time), _at(time), _at(points), len(rows), _at(rows), int(one_sided), share, _at(out)
-    )
+    _library.neighbour_scores(len(time), _at(time), _at(points), len(rows), _at(rows), int(one_sided), share, _at(out))
     return out
 
 
@@ -210,5 +203,5 @@ def homography_residual(a: Floats, b: Floats, iterations: int) -> float:
     """Median distance of points b (n, 2) from a mapped by the best homography, in b's unit."""
     count, scratch = len(a), np.empty(6 * len(a))
     a, b = _rows_last(a), _rows_last(b)
-    found: float = _library().homography_residual(count, _at(a), _at(b), iterations, _at(scratch))
+    found: float = _library.homography_residual(count, _at(a), _at(b), iterations, _at(scratch))
     return found

@@ -39,7 +39,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def both(library: Path, monkeypatch: pytest.MonkeyPatch) -> Both:
     """What a function gives by the kernels, and by numpy."""
-    monkeypatch.setattr(kernels, "_LIBRARY", kernels.load(library))
+    monkeypatch.setattr(kernels, "_library", kernels.load(library))
 
     def run(function: Callable[[], Floats]) -> tuple[Floats, Floats]:
         found = []
