@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hub.two_view.relative_pose import TwoViewGeometry
+from hub.two_view.relative_pose import RelativePose, TwoViewGeometry
 from protocols.geometry import kernels
 from protocols.geometry.compiled import dgesv
 from protocols.geometry.types import Floats
@@ -102,6 +102,15 @@ def refine(
     final_width: of the Cauchy weight [sigma].
     """
     damping, width = 1e-3, max(3.0 * initial_misfit, final_width)
+    compiled: kernels.SampledTracks | None = getattr(sampler, "compiled", None)
+    if compiled is not None and isinstance(geometry, RelativePose):
+        state = np.concatenate([geometry.rotation.ravel(), geometry.direction, [inverse_rate, intercept]])
+        prior, sigma = noise.rate_prior_std**-2, (noise.sigma_a, noise.sigma_b)
+        limits = _MIN_ROWS, iterations, _TOLERANCE
+        cost, normal = kernels.refine_pose(compiled, state, sigma, prior, (width, final_width), limits, fixed_geometry)
+        pose = geometry if fixed_geometry else RelativePose(state[:9].reshape(3, 3), state[9:12])
+        inverse_rate, intercept = state[12:].tolist()
+        return RefinementResult(cost, inverse_rate, intercept, pose, normal) if np.isfinite(cost) else None
     system_at = partial(_linearise, sampler, noise=noise, fixed_geometry=fixed_geometry)
     rows, last_gain = system_at(geometry, inverse_rate, intercept), 0.0
     system = rows(width)

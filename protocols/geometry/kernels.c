@@ -187,7 +187,7 @@ enum { BLOCK = 64, MOST_COLUMNS = 9 };
 /* hub.two_view.refinement: normal (k + 2, k + 2), gradient (k + 2,) and cost of Sampson distances with Cauchy weights,
    at the time map t_b = inverse_rate * centred_time + intercept. points: (2, n) of a; tracks: of b, whose polynomials
    are (4, 2, size). tangents: (k, 3, 3) derivatives of the matrix (3, 3). Returns the number of rows where b is. */
-integer sampson_system(integer n, const double *points, const double *centred_time, const tracks_t *tracks,
+WIDE integer sampson_system(integer n, const double *points, const double *centred_time, const tracks_t *tracks,
                        double inverse_rate, double intercept, const double *matrix, const double *tangents,
                        integer k, double variance_a, double variance_b, double width, double *normal,
                        double *gradient, double *cost)
@@ -262,6 +262,169 @@ integer sampson_system(integer n, const double *points, const double *centred_ti
     }
     *cost = total * width * width;
     return count;
+}
+
+/* out = a b of (3, 3). */
+static void multiply(const double *a, const double *b, double *out)
+{
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) out[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
+}
+
+/* out = hat(w) b. */
+static void cross(const double *w, const double *b, double *out)
+{
+    const double hat[9] = {0.0, -w[2], w[1], w[2], 0.0, -w[0], -w[1], w[0], 0.0};
+    multiply(hat, b, out);
+}
+
+/* hub.two_view.relative_pose.orthogonal_axes: axes (2, 3). */
+static void orthogonal_axes(const double *d, double *axes)
+{
+    double x = d[0], y = d[1], z = d[2], p, q, r;
+    if (fabs(x) <= fabs(y) && fabs(x) <= fabs(z)) p = 0.0, q = z, r = -y;
+    else if (fabs(y) <= fabs(z)) p = -z, q = 0.0, r = x;
+    else p = y, q = -x, r = 0.0;
+    double length = sqrt(p * p + q * q + r * r);
+    p /= length, q /= length, r /= length;
+    const double both[6] = {p, q, r, y * r - z * q, z * p - x * r, x * q - y * p};
+    memcpy(axes, both, sizeof both);
+}
+
+/* protocols.geometry.so3.exp of w, times rotation. */
+static void turned(const double *w, const double *rotation, double *out)
+{
+    double x = w[0], y = w[1], z = w[2], angle2 = x * x + y * y + z * z, angle = sqrt(angle2);
+    double a = angle < 1e-4 ? 1.0 - angle2 / 6.0 : sin(angle) / angle;
+    double b = angle < 1e-4 ? 0.5 - angle2 / 24.0 : (1.0 - cos(angle)) / angle2;
+    double ax = a * x, ay = a * y, az = a * z, xy = b * x * y, xz = b * x * z, yz = b * y * z;
+    const double exp[9] = {1.0 - b * (y * y + z * z), xy - az, xz + ay, xy + az, 1.0 - b * (x * x + z * z), yz - ax,
+                           xz - ay, yz + ax, 1.0 - b * (x * x + y * y)};
+    multiply(exp, rotation, out);
+}
+
+/* Gaussian elimination with partial pivoting of (n, n), n at most 7; the solution in right. 0 if singular. */
+static int solve(integer n, double *matrix, double *right)
+{
+    for (integer k = 0; k < n; k++) {
+        integer pivot = k;
+        for (integer i = k + 1; i < n; i++)
+            if (fabs(matrix[i * n + k]) > fabs(matrix[pivot * n + k])) pivot = i;
+        if (matrix[pivot * n + k] == 0.0) return 0;
+        for (integer j = 0; j < n && pivot != k; j++) {
+            double other = matrix[k * n + j];
+            matrix[k * n + j] = matrix[pivot * n + j];
+            matrix[pivot * n + j] = other;
+        }
+        double other = right[k];
+        right[k] = right[pivot];
+        right[pivot] = other;
+        for (integer i = k + 1; i < n; i++) {
+            double factor = matrix[i * n + k] / matrix[k * n + k];
+            for (integer j = k + 1; j < n; j++) matrix[i * n + j] -= factor * matrix[k * n + j];
+            right[i] -= factor * right[k];
+        }
+    }
+    for (integer k = n - 1; k >= 0; k--) {
+        for (integer j = k + 1; j < n; j++) right[k] -= matrix[k * n + j] * right[j];
+        right[k] /= matrix[k * n + k];
+    }
+    return 1;
+}
+
+/* A relative pose and a time map, as hub.two_view.refinement has them. */
+typedef struct {
+    double rotation[9], direction[3], inverse_rate, intercept;
+} alignment_t;
+
+typedef struct {
+    double normal[49], gradient[7], cost;
+} system_t;
+
+typedef struct {
+    integer n, columns, least;
+    const double *points, *centred_time;
+    const tracks_t *tracks;
+    double variance_a, variance_b, prior;
+} samples_t;
+
+static void alignment_system(const samples_t *samples, const alignment_t *at, double width, system_t *out)
+{
+    integer k = samples->columns - 2;
+    double matrix[9], tangents[45], axes[6], part[9];
+    cross(at->direction, at->rotation, matrix);
+    for (int axis = 0; axis < 3 && k; axis++) {
+        const double unit[3] = {axis == 0, axis == 1, axis == 2};
+        cross(unit, at->rotation, part);
+        cross(at->direction, part, tangents + 9 * axis);
+    }
+    orthogonal_axes(at->direction, axes);
+    cross(axes, at->rotation, tangents + 27);
+    cross(axes + 3, at->rotation, tangents + 36);
+    integer count = sampson_system(samples->n, samples->points, samples->centred_time, samples->tracks, at->inverse_rate,
+                                   at->intercept, matrix, tangents, k, samples->variance_a, samples->variance_b, width,
+                                   out->normal, out->gradient, &out->cost);
+    double off = at->inverse_rate - 1.0;
+    out->normal[samples->columns * samples->columns - 1] += samples->prior;
+    out->gradient[samples->columns - 1] += samples->prior * off;
+    out->cost = count < samples->least ? INFINITY : (out->cost + samples->prior * off * off) / (double)count;
+}
+
+/* hub.two_view.refinement.refine of a relative pose: state (14,) rotation, direction, inverse rate and intercept, in
+   place; fixed: whether the pose is given; normal (k + 2, k + 2). Returns the cost, infinite where there is none. */
+double refine_pose(integer n, const double *points, const double *centred_time, const tracks_t *tracks, double *state,
+                   integer fixed, double variance_a, double variance_b, double prior, integer least, double width,
+                   double final_width, integer iterations, double tolerance, double *normal)
+{
+    const integer columns = fixed ? 2 : 7;
+    samples_t samples = {n, columns, least, points, centred_time, tracks, variance_a, variance_b, prior};
+    alignment_t at, trial_at;
+    system_t system, trial;
+    double damping = 1e-3, last_gain = 0.0;
+    memcpy(&at, state, sizeof at);
+    alignment_system(&samples, &at, width, &system);
+    if (!isfinite(system.cost)) return INFINITY;
+    for (integer i = 0; i < iterations; i++) {
+        double damped[49], step[7], axes[6], length = 0.0;
+        memcpy(damped, system.normal, sizeof damped);
+        for (integer p = 0; p < columns; p++) {
+            damped[p * (columns + 1)] += damping * system.normal[p * (columns + 1)] + 1e-12;
+            step[p] = -system.gradient[p];
+        }
+        if (!solve(columns, damped, step)) return INFINITY;
+        trial_at = at;
+        trial_at.inverse_rate += step[columns - 1];
+        trial_at.intercept += step[columns - 2];
+        if (!fixed) {
+            turned(step, at.rotation, trial_at.rotation);
+            orthogonal_axes(at.direction, axes);
+            for (int k = 0; k < 3; k++) trial_at.direction[k] += step[3] * axes[k] + step[4] * axes[3 + k];
+            for (int k = 0; k < 3; k++) length += trial_at.direction[k] * trial_at.direction[k];
+            for (int k = 0; k < 3; k++) trial_at.direction[k] /= sqrt(length);
+        }
+        alignment_system(&samples, &trial_at, width, &trial);
+        if (trial.cost < system.cost) {
+            at = trial_at;
+            damping = damping / 5.0 > 1e-9 ? damping / 5.0 : 1e-9;
+            if (width == final_width) {
+                double gain = system.cost - trial.cost, limit = tolerance * system.cost;
+                system = trial;
+                if (gain * gain / (gain > last_gain ? gain : last_gain) < limit) break;
+                last_gain = gain;
+                continue;
+            }
+        } else if (width == final_width) {
+            damping *= 8.0;
+            if (damping > 1e3) break;
+            continue;
+        }
+        width = 0.5 * width > final_width ? 0.5 * width : final_width;
+        alignment_system(&samples, &at, width, &system);
+    }
+    if (!(at.inverse_rate > 0.5 && at.inverse_rate < 2.0) || width > final_width) return INFINITY;
+    memcpy(state, &at, sizeof at);
+    memcpy(normal, system.normal, sizeof(double) * (size_t)(columns * columns));
+    return system.cost;
 }
 
 #define LANES 8
@@ -507,7 +670,7 @@ static double hartley(integer n, const double *points, double *out)
 
 /* hub.two_view.relative_pose.homography_residual of points (2, n) of a and b, before the division by the median of a
    Rayleigh variable. scratch: (6 n,). */
-double homography_residual(integer n, const double *points_a, const double *points_b, integer iterations,
+WIDE double homography_residual(integer n, const double *points_a, const double *points_b, integer iterations,
                            double *scratch)
 {
     static const int index[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};

@@ -25,6 +25,7 @@ _SIGNATURES = {
     "add_rows": "nppnpppp",
     "brown_distortion": "npppp",
     "sampson_system": "npppddppndddppp",
+    "refine_pose": "nppppndddnddndp",
     "smallest_eigenvalues": "npddndp",
     "neighbour_scores": "nppnpndp",
     "homography_residual": "nppnp",
@@ -39,7 +40,8 @@ def load(file: Path) -> CDLL | None:
         for name, kinds in _SIGNATURES.items():
             function = getattr(library, name)
             function.argtypes, function.restype = [_KINDS[kind] for kind in kinds], None
-        library.sampson_system.restype, library.homography_residual.restype = c_int64, c_double
+        library.sampson_system.restype = c_int64
+        library.homography_residual.restype = library.refine_pose.restype = c_double
     except (OSError, AttributeError):
         return None
     return library
@@ -179,6 +181,27 @@ def sampson_system(
         samples.count, *samples.at, rate, intercept, _at(matrix), _at(tangents), free, *variances, width, *out
     )
     return count, both[:-1], both[-1], cost.value
+
+
+def refine_pose(
+    samples: SampledTracks,
+    state: Floats,
+    sigma: tuple[float, float],
+    prior: float,
+    widths: tuple[float, float],
+    limits: tuple[int, int, float],
+    fixed: bool,
+) -> tuple[float, Floats]:
+    """Cost, infinite where there is none, and normal matrix of `hub.two_view.refinement.refine` from a relative pose.
+
+    state: (14,) rotation, direction, inverse rate and intercept, in place. widths: first and last of the Cauchy weight.
+    limits: least rows, most iterations, tolerance. fixed: whether the pose is given.
+    """
+    normal, (rows, iterations, tolerance) = np.empty((2, 2) if fixed else (7, 7)), limits
+    noise = fixed, sigma[0] ** 2, sigma[1] ** 2, prior
+    end = rows, *widths, iterations, tolerance, _at(normal)
+    cost: float = _library.refine_pose(samples.count, *samples.at, _at(state), *noise, *end)
+    return cost, normal
 
 
 def smallest_eigenvalues(
