@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hub.two_view.relative_pose import RelativePose, TwoViewGeometry
+from hub.two_view.relative_pose import FundamentalMatrix, RelativePose, TwoViewGeometry
 from protocols.geometry import kernels
 from protocols.geometry.compiled import dgesv
 from protocols.geometry.types import Floats
@@ -103,14 +103,15 @@ def refine(
     """
     damping, width = 1e-3, max(3.0 * initial_misfit, final_width)
     compiled: kernels.SampledTracks | None = getattr(sampler, "compiled", None)
-    if compiled is not None and isinstance(geometry, RelativePose):
-        state = np.concatenate([geometry.rotation.ravel(), geometry.direction, [inverse_rate, intercept]])
-        prior, sigma = noise.rate_prior_std**-2, (noise.sigma_a, noise.sigma_b)
-        limits = _MIN_ROWS, iterations, _TOLERANCE
-        cost, normal = kernels.refine_pose(compiled, state, sigma, prior, (width, final_width), limits, fixed_geometry)
-        pose = geometry if fixed_geometry else RelativePose(state[:9].reshape(3, 3), state[9:12])
-        inverse_rate, intercept = state[12:].tolist()
-        return RefinementResult(cost, inverse_rate, intercept, pose, normal) if np.isfinite(cost) else None
+    if compiled is not None:
+        is_pose, free, numbers = _packed(geometry)
+        state = np.concatenate([*numbers, [inverse_rate, intercept]])
+        noises, limits = (noise.sigma_a, noise.sigma_b, noise.rate_prior_std), (_MIN_ROWS, iterations, _TOLERANCE)
+        kind, widths = (is_pose, 0 if fixed_geometry else free), (width, final_width)
+        cost, normal = kernels.refine_alignment(compiled, state, kind, noises, widths, limits)
+        left, right, (inverse_rate, intercept) = state[:9].reshape(3, 3), state[9:18].reshape(3, 3), state[21:].tolist()
+        moved = RelativePose(left, state[18:21]) if is_pose else FundamentalMatrix(left, right, float(state[18]))
+        return RefinementResult(cost, inverse_rate, intercept, moved, normal) if np.isfinite(cost) else None
     system_at = partial(_linearise, sampler, noise=noise, fixed_geometry=fixed_geometry)
     rows, last_gain = system_at(geometry, inverse_rate, intercept), 0.0
     system = rows(width)
@@ -162,24 +163,25 @@ def _linearise(
 ) -> Callable[[float], _System]:
     """The system at a state, by the width of the Cauchy weights."""
     tangents = np.zeros((0, 3, 3)) if fixed_geometry else geometry.tangents()
-    compiled: kernels.SampledTracks | None = getattr(sampler, "compiled", None)
-    prior = 1.0 / noise.rate_prior_std**2
-    matrix = geometry.matrix
-    rows = None if compiled else _residuals(sampler(inverse_rate, intercept), matrix, tangents, noise)
-    time_map, sigma = (inverse_rate, intercept), (noise.sigma_a, noise.sigma_b)
+    rows = _residuals(sampler(inverse_rate, intercept), geometry.matrix, tangents, noise)
+    prior, count = 1.0 / noise.rate_prior_std**2, len(rows[0])
 
     def system(width: float) -> _System:
-        if compiled is None:
-            count, normal, gradient, cost = _normal_equations(rows, len(tangents) + 2, width)
-        else:
-            count, normal, gradient, cost = kernels.sampson_system(compiled, time_map, matrix, tangents, sigma, width)
         if count < _MIN_ROWS:
-            return normal, gradient, np.inf
+            return np.zeros((0, 0)), np.zeros(0), np.inf
+        normal, gradient, cost = _normal_equations(rows, width)
         normal[-1, -1] += prior
         gradient[-1] += prior * (inverse_rate - 1.0)
         return normal, gradient, (cost + prior * (inverse_rate - 1.0) ** 2) / count
 
     return system
+
+
+def _packed(geometry: TwoViewGeometry) -> tuple[bool, int, list[Floats]]:
+    """Whether a geometry is a pose, its degrees of freedom, and its numbers as `kernels.refine_alignment` has them."""
+    if isinstance(geometry, RelativePose):
+        return True, 5, [geometry.rotation.ravel(), np.zeros(9), geometry.direction]
+    return False, 7, [geometry.left.ravel(), geometry.right.ravel(), np.array([geometry.angle, 0.0, 0.0])]
 
 
 def _residuals(pairs: PointPairs, matrix: Floats, tangents: Floats, noise: NoiseModel) -> tuple[Floats, Floats]:
@@ -189,13 +191,10 @@ def _residuals(pairs: PointPairs, matrix: Floats, tangents: Floats, noise: Noise
     line_b += matrix[:, 2:]
     line_a = matrix[:2, :2].T @ b
     line_a += matrix[2, :2, None]
-    variance = np.einsum("in,in->n", line_b[:2], line_b[:2])
-    variance *= noise.sigma_b**2
+    variance = noise.sigma_b**2 * np.einsum("in,in->n", line_b[:2], line_b[:2])
     variance += noise.sigma_a**2 * np.einsum("in,in->n", line_a, line_a)
     over = 1.0 / np.sqrt(np.maximum(variance, 1e-30))
-    residual = np.einsum("in,in->n", b, line_b[:2])
-    residual += line_b[2]
-    residual *= over
+    residual = (np.einsum("in,in->n", b, line_b[:2]) + line_b[2]) * over
     count, free = len(residual), len(tangents)
     jacobian, products = np.empty((free + 2, count)), np.empty((3, 3, count))
     np.multiply(b[:, None], a, out=products[:2, :2])
@@ -207,10 +206,9 @@ def _residuals(pairs: PointPairs, matrix: Floats, tangents: Floats, noise: Noise
     return residual, jacobian
 
 
-def _normal_equations(rows: tuple[Floats, Floats] | None, size: int, width: float) -> tuple[int, Floats, Floats, float]:
-    """Number of rows, normal matrix, gradient and robust cost of `_residuals`, with Cauchy weights of a width."""
-    residual, jacobian = rows or (np.zeros(0), np.zeros((size, 0)))
+def _normal_equations(rows: tuple[Floats, Floats], width: float) -> _System:
+    """Normal matrix, gradient and robust cost of `_residuals`, with Cauchy weights of a width."""
+    residual, jacobian = rows
     ratio = np.square(residual / width)
     weighted = jacobian / (1.0 + ratio)
-    cost = float((width**2 * np.log1p(ratio)).sum())
-    return len(residual), weighted @ jacobian.T, weighted @ residual, cost
+    return weighted @ jacobian.T, weighted @ residual, float((width**2 * np.log1p(ratio)).sum())

@@ -187,7 +187,7 @@ enum { BLOCK = 64, MOST_COLUMNS = 9 };
 /* hub.two_view.refinement: normal (k + 2, k + 2), gradient (k + 2,) and cost of Sampson distances with Cauchy weights,
    at the time map t_b = inverse_rate * centred_time + intercept. points: (2, n) of a; tracks: of b, whose polynomials
    are (4, 2, size). tangents: (k, 3, 3) derivatives of the matrix (3, 3). Returns the number of rows where b is. */
-WIDE integer sampson_system(integer n, const double *points, const double *centred_time, const tracks_t *tracks,
+WIDE static integer sampson_system(integer n, const double *points, const double *centred_time, const tracks_t *tracks,
                        double inverse_rate, double intercept, const double *matrix, const double *tangents,
                        integer k, double variance_a, double variance_b, double width, double *normal,
                        double *gradient, double *cost)
@@ -291,8 +291,8 @@ static void orthogonal_axes(const double *d, double *axes)
     memcpy(axes, both, sizeof both);
 }
 
-/* protocols.geometry.so3.exp of w, times rotation. */
-static void turned(const double *w, const double *rotation, double *out)
+/* protocols.geometry.so3.exp of w. */
+static void rotation_of(const double *w, double *out)
 {
     double x = w[0], y = w[1], z = w[2], angle2 = x * x + y * y + z * z, angle = sqrt(angle2);
     double a = angle < 1e-4 ? 1.0 - angle2 / 6.0 : sin(angle) / angle;
@@ -300,10 +300,10 @@ static void turned(const double *w, const double *rotation, double *out)
     double ax = a * x, ay = a * y, az = a * z, xy = b * x * y, xz = b * x * z, yz = b * y * z;
     const double exp[9] = {1.0 - b * (y * y + z * z), xy - az, xz + ay, xy + az, 1.0 - b * (x * x + z * z), yz - ax,
                            xz - ay, yz + ax, 1.0 - b * (x * x + y * y)};
-    multiply(exp, rotation, out);
+    memcpy(out, exp, sizeof exp);
 }
 
-/* Gaussian elimination with partial pivoting of (n, n), n at most 7; the solution in right. 0 if singular. */
+/* Gaussian elimination with partial pivoting of (n, n); the solution in right. 0 if singular. */
 static int solve(integer n, double *matrix, double *right)
 {
     for (integer k = 0; k < n; k++) {
@@ -332,35 +332,86 @@ static int solve(integer n, double *matrix, double *right)
     return 1;
 }
 
-/* A relative pose and a time map, as hub.two_view.refinement has them. */
+/* A two-view geometry and a time map, as hub.two_view.refinement has them: of a relative pose left is the rotation and
+   rest the direction; of a fundamental matrix rest is the angle. */
 typedef struct {
-    double rotation[9], direction[3], inverse_rate, intercept;
+    double left[9], right[9], rest[3], inverse_rate, intercept;
 } alignment_t;
 
 typedef struct {
-    double normal[49], gradient[7], cost;
+    double normal[MOST_COLUMNS * MOST_COLUMNS], gradient[MOST_COLUMNS], cost;
 } system_t;
 
 typedef struct {
-    integer n, columns, least;
+    integer n, columns, least, calibrated;
     const double *points, *centred_time;
     const tracks_t *tracks;
     double variance_a, variance_b, prior;
 } samples_t;
 
+/* left diag(first, second, 0) right. */
+static void of_rank_two(const alignment_t *at, double first, double second, double *out)
+{
+    double scaled[9];
+    for (int i = 0; i < 3; i++) {
+        scaled[3 * i] = at->left[3 * i] * first;
+        scaled[3 * i + 1] = at->left[3 * i + 1] * second;
+        scaled[3 * i + 2] = 0.0;
+    }
+    multiply(scaled, at->right, out);
+}
+
+/* `matrix` (3, 3) and `tangents` (5 or 7, 3, 3) of hub.two_view.relative_pose. */
+static void geometry_of(const alignment_t *at, integer calibrated, double *matrix, double *tangents)
+{
+    double axes[6], part[9];
+    if (calibrated) cross(at->rest, at->left, matrix);
+    else of_rank_two(at, cos(at->rest[0]), sin(at->rest[0]), matrix);
+    for (int axis = 0; axis < 3; axis++) {
+        const double unit[3] = {axis == 0, axis == 1, axis == 2};
+        if (calibrated) {
+            cross(unit, at->left, part);
+            cross(at->rest, part, tangents + 9 * axis);
+        } else {
+            const double hat[9] = {0.0, -unit[2], unit[1], unit[2], 0.0, -unit[0], -unit[1], unit[0], 0.0};
+            cross(unit, matrix, tangents + 9 * axis);
+            multiply(matrix, hat, tangents + 27 + 9 * axis);
+        }
+    }
+    if (calibrated) {
+        orthogonal_axes(at->rest, axes);
+        cross(axes, at->left, tangents + 27);
+        cross(axes + 3, at->left, tangents + 36);
+    } else {
+        of_rank_two(at, -sin(at->rest[0]), cos(at->rest[0]), tangents + 54);
+    }
+}
+
+/* `retract` of hub.two_view.relative_pose. */
+static void retract(alignment_t *at, integer calibrated, const double *step)
+{
+    double turn[9], turned[9], axes[6], length = 0.0;
+    rotation_of(step, turn);
+    multiply(turn, at->left, turned);
+    memcpy(at->left, turned, sizeof turned);
+    if (!calibrated) {
+        rotation_of(step + 3, turn);
+        multiply(at->right, turn, turned);
+        memcpy(at->right, turned, sizeof turned);
+        at->rest[0] += step[6];
+        return;
+    }
+    orthogonal_axes(at->rest, axes);
+    for (int k = 0; k < 3; k++) at->rest[k] += step[3] * axes[k] + step[4] * axes[3 + k];
+    for (int k = 0; k < 3; k++) length += at->rest[k] * at->rest[k];
+    for (int k = 0; k < 3; k++) at->rest[k] /= sqrt(length);
+}
+
 static void alignment_system(const samples_t *samples, const alignment_t *at, double width, system_t *out)
 {
     integer k = samples->columns - 2;
-    double matrix[9], tangents[45], axes[6], part[9];
-    cross(at->direction, at->rotation, matrix);
-    for (int axis = 0; axis < 3 && k; axis++) {
-        const double unit[3] = {axis == 0, axis == 1, axis == 2};
-        cross(unit, at->rotation, part);
-        cross(at->direction, part, tangents + 9 * axis);
-    }
-    orthogonal_axes(at->direction, axes);
-    cross(axes, at->rotation, tangents + 27);
-    cross(axes + 3, at->rotation, tangents + 36);
+    double matrix[9], tangents[63];
+    geometry_of(at, samples->calibrated, matrix, tangents);
     integer count = sampson_system(samples->n, samples->points, samples->centred_time, samples->tracks, at->inverse_rate,
                                    at->intercept, matrix, tangents, k, samples->variance_a, samples->variance_b, width,
                                    out->normal, out->gradient, &out->cost);
@@ -370,14 +421,15 @@ static void alignment_system(const samples_t *samples, const alignment_t *at, do
     out->cost = count < samples->least ? INFINITY : (out->cost + samples->prior * off * off) / (double)count;
 }
 
-/* hub.two_view.refinement.refine of a relative pose: state (14,) rotation, direction, inverse rate and intercept, in
-   place; fixed: whether the pose is given; normal (k + 2, k + 2). Returns the cost, infinite where there is none. */
-double refine_pose(integer n, const double *points, const double *centred_time, const tracks_t *tracks, double *state,
-                   integer fixed, double variance_a, double variance_b, double prior, integer least, double width,
-                   double final_width, integer iterations, double tolerance, double *normal)
+/* hub.two_view.refinement.refine: state (23,) as alignment_t, in place; free: the geometry's parameters, 0 if it is
+   given; normal (free + 2, free + 2). Returns the cost, infinite where there is none. */
+double refine_alignment(integer n, const double *points, const double *centred_time, const tracks_t *tracks,
+                        double *state, integer calibrated, integer free_count, double variance_a, double variance_b,
+                        double prior, integer least, double width, double final_width, integer iterations,
+                        double tolerance, double *normal)
 {
-    const integer columns = fixed ? 2 : 7;
-    samples_t samples = {n, columns, least, points, centred_time, tracks, variance_a, variance_b, prior};
+    const integer columns = free_count + 2;
+    samples_t samples = {n, columns, least, calibrated, points, centred_time, tracks, variance_a, variance_b, prior};
     alignment_t at, trial_at;
     system_t system, trial;
     double damping = 1e-3, last_gain = 0.0;
@@ -385,7 +437,7 @@ double refine_pose(integer n, const double *points, const double *centred_time, 
     alignment_system(&samples, &at, width, &system);
     if (!isfinite(system.cost)) return INFINITY;
     for (integer i = 0; i < iterations; i++) {
-        double damped[49], step[7], axes[6], length = 0.0;
+        double damped[MOST_COLUMNS * MOST_COLUMNS], step[MOST_COLUMNS];
         memcpy(damped, system.normal, sizeof damped);
         for (integer p = 0; p < columns; p++) {
             damped[p * (columns + 1)] += damping * system.normal[p * (columns + 1)] + 1e-12;
@@ -395,13 +447,7 @@ double refine_pose(integer n, const double *points, const double *centred_time, 
         trial_at = at;
         trial_at.inverse_rate += step[columns - 1];
         trial_at.intercept += step[columns - 2];
-        if (!fixed) {
-            turned(step, at.rotation, trial_at.rotation);
-            orthogonal_axes(at.direction, axes);
-            for (int k = 0; k < 3; k++) trial_at.direction[k] += step[3] * axes[k] + step[4] * axes[3 + k];
-            for (int k = 0; k < 3; k++) length += trial_at.direction[k] * trial_at.direction[k];
-            for (int k = 0; k < 3; k++) trial_at.direction[k] /= sqrt(length);
-        }
+        if (free_count) retract(&trial_at, calibrated, step);
         alignment_system(&samples, &trial_at, width, &trial);
         if (trial.cost < system.cost) {
             at = trial_at;

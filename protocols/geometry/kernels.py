@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from ctypes import CDLL, addressof, byref, c_char, c_double, c_int64, c_void_p
+from ctypes import CDLL, addressof, c_char, c_double, c_int64, c_void_p
 from pathlib import Path
 from typing import cast
 
@@ -24,8 +24,7 @@ _SIGNATURES = {
     "spline_normal": "npppnpnpdnpp",
     "add_rows": "nppnpppp",
     "brown_distortion": "npppp",
-    "sampson_system": "npppddppndddppp",
-    "refine_pose": "nppppndddnddndp",
+    "refine_alignment": "nppppnndddnddndp",
     "smallest_eigenvalues": "npddndp",
     "neighbour_scores": "nppnpndp",
     "homography_residual": "nppnp",
@@ -40,8 +39,7 @@ def load(file: Path) -> CDLL | None:
         for name, kinds in _SIGNATURES.items():
             function = getattr(library, name)
             function.argtypes, function.restype = [_KINDS[kind] for kind in kinds], None
-        library.sampson_system.restype = c_int64
-        library.homography_residual.restype = library.refine_pose.restype = c_double
+        library.homography_residual.restype = library.refine_alignment.restype = c_double
     except (OSError, AttributeError):
         return None
     return library
@@ -137,7 +135,7 @@ def brown_distortion(normalised: Floats, coefficients: Floats) -> tuple[Floats, 
 
 
 class SampledTracks:
-    """Points of one camera's tracks at their own times, and the splines of another camera's, for `sampson_system`.
+    """Points of one camera's tracks at their own times, and the splines of another camera's, for `refine_alignment`.
 
     points: (n, 2), label by label. centred_time: (n,). rows: number of each label's rows. splines: of each label, the
     basis (4, stretches) and the polynomials (4, 2, m).
@@ -157,50 +155,23 @@ class SampledTracks:
         self.at = _at(self._kept[0]), _at(self._kept[1]), _at(tracks)
 
 
-def sampson_system(
-    samples: SampledTracks,
-    time_map: tuple[float, float],
-    matrix: Floats,
-    tangents: Floats,
-    sigma: tuple[float, float],
-    width: float,
-) -> tuple[int, Floats, Floats, float]:
-    """Rows, normal matrix (k + 2, k + 2), gradient and cost of Sampson distances with Cauchy weights of a width.
-
-    time_map: inverse rate and intercept of t_b. tangents: (k, 3, 3) derivatives of ``matrix`` (3, 3), k at most 7.
-    sigma: noise of a and of b.
-    """
-    free, (rate, intercept) = len(tangents), time_map
-    size, cost = free + 2, c_double()
-    both = np.empty((size + 1, size))
-    matrix, tangents = np.ascontiguousarray(matrix), np.ascontiguousarray(tangents)
-    to = _at(both)
-    out = to, to + both.itemsize * size * size, byref(cost)
-    variances = sigma[0] ** 2, sigma[1] ** 2
-    count: int = _library.sampson_system(
-        samples.count, *samples.at, rate, intercept, _at(matrix), _at(tangents), free, *variances, width, *out
-    )
-    return count, both[:-1], both[-1], cost.value
-
-
-def refine_pose(
+def refine_alignment(
     samples: SampledTracks,
     state: Floats,
-    sigma: tuple[float, float],
-    prior: float,
+    kind: tuple[bool, int],
+    noise: tuple[float, float, float],
     widths: tuple[float, float],
     limits: tuple[int, int, float],
-    fixed: bool,
 ) -> tuple[float, Floats]:
-    """Cost, infinite where there is none, and normal matrix of `hub.two_view.refinement.refine` from a relative pose.
+    """Cost, infinite where there is none, and normal matrix of `hub.two_view.refinement.refine`.
 
-    state: (14,) rotation, direction, inverse rate and intercept, in place. widths: first and last of the Cauchy weight.
-    limits: least rows, most iterations, tolerance. fixed: whether the pose is given.
+    state: (23,) of a pose rotation, nine unused, direction; or left, right, angle, two unused; then inverse rate and
+    intercept; in place. kind: whether a pose, and free parameters of the geometry. noise: sigma of a and of b, prior of
+    the rate. widths: first and last of the Cauchy weight. limits: least rows, most iterations, tolerance.
     """
-    normal, (rows, iterations, tolerance) = np.empty((2, 2) if fixed else (7, 7)), limits
-    noise = fixed, sigma[0] ** 2, sigma[1] ** 2, prior
-    end = rows, *widths, iterations, tolerance, _at(normal)
-    cost: float = _library.refine_pose(samples.count, *samples.at, _at(state), *noise, *end)
+    normal, (least, iterations, tolerance) = np.empty((kind[1] + 2,) * 2), limits
+    given = *kind, noise[0] ** 2, noise[1] ** 2, noise[2] ** -2, least, *widths, iterations, tolerance
+    cost: float = _library.refine_alignment(samples.count, *samples.at, _at(state), *given, _at(normal))
     return cost, normal
 
 
