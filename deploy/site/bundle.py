@@ -7,6 +7,7 @@ own subset of the project's requirements, which is installed without the other d
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import subprocess
 import sys
@@ -286,6 +287,8 @@ def _pip(arguments: Sequence[str]) -> None:
         text=True,
         timeout=1800,
         check=False,
+        # What is compiled here might not run on the board.
+        env={**os.environ, "SYNCLINE_PURE": "1"},
     )
     if ended.returncode:
         lines = [line for line in ended.stderr.splitlines() if line.startswith("ERROR")]

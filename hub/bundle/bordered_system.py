@@ -9,24 +9,16 @@ length of the recording (Schur complement C - Bᵀ A⁻¹ B).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.linalg.lapack import dtbtrs
-from scipy.sparse import csc_array
 
+from hub.trajectory.banded import cho_solve_banded, cholesky_banded, solve_upper_transposed
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT, SplineBasis
+from protocols.geometry import kernels
+from protocols.geometry.compiled import csc_matvecs
 from protocols.geometry.types import Floats, Ints
-
-try:  # what a product of scipy's sparse matrices ends in; here without its checks, and added in place
-    from scipy.sparse import _sparsetools
-
-    _csc_matvecs: Callable[..., None] | None = _sparsetools.csc_matvecs
-except (ImportError, AttributeError):
-    _csc_matvecs = None
 
 _ROWS_AT_ONCE = 1001  # products of so many fit a core's cache; no power of two, whose columns displace each other there
 
@@ -67,6 +59,9 @@ class PathBlocks:
         """
         others = terms.shape[1] - 3
         crossed, gram = np.zeros((self.size + SUPPORT, 3 * others)), np.zeros((others, others))
+        if kernels.AVAILABLE and others <= kernels.MOST_TERMS:
+            kernels.add_rows(index, weights.T, terms, self._sums, crossed, gram)
+            return crossed.reshape(-1, others)[: 3 * self.size], gram
         for first in range(0, len(index), _ROWS_AT_ONCE):
             rows = slice(first, first + _ROWS_AT_ONCE)
             u, v = terms[:, :, rows]
@@ -110,14 +105,14 @@ def border_block(index: Ints, weights: Floats, values: Floats, size: int) -> Flo
 
 
 def add_row_sums(out: Floats, weights: Floats, columns: Ints, values: Floats) -> None:
-    """Add to out (size, p) the sums over rows of weights (n, k) at columns (n, k) times values (n, p)."""
+    """Add to out (size, p) the sums over rows of weights (n, k) at columns (n, k) times values (n, p).
+
+    By what a product of scipy's sparse matrices ends in, without its checks, and added in place.
+    """
     rows, each = weights.shape
     starts, places = np.arange(0, each * rows + 1, each, dtype=np.int32), columns.astype(np.int32).ravel()
-    if _csc_matvecs is None:
-        out += np.asarray(csc_array((weights.ravel(), places, starts), shape=(len(out), rows)) @ values)
-    else:
-        flat = np.ascontiguousarray(values).ravel()
-        _csc_matvecs(len(out), rows, values.shape[1], starts, places, weights.ravel(), flat, out.reshape(-1))
+    flat = np.ascontiguousarray(values).ravel()
+    csc_matvecs(len(out), rows, values.shape[1], starts, places, weights.ravel(), flat, out.reshape(-1))
 
 
 def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats, metric: Floats) -> Floats:
@@ -173,14 +168,14 @@ class Elimination:
 def eliminate(system: BorderedSystem, damping: float = 0.0) -> Elimination:
     """Factor A (damped on its diagonal) and form the Schur complement. Raises LinAlgError if not positive definite."""
     factor = _damped_cholesky(system.band, damping)
-    a_inv_b = cho_solve_banded((factor, False), system.border, check_finite=False)
+    a_inv_b = cho_solve_banded(factor, system.border)
     reduced = system.corner - system.border.T @ a_inv_b
-    return Elimination(factor, np.asarray(a_inv_b), np.asarray(0.5 * (reduced + reduced.T)))
+    return Elimination(factor, a_inv_b, np.asarray(0.5 * (reduced + reduced.T)))
 
 
 def cho_solve_path(parts: Elimination, rhs: Floats) -> Floats:
     """A⁻¹ right, (3 n,) of (3 n,)."""
-    return np.asarray(cho_solve_banded((parts.factor, False), rhs, check_finite=False))
+    return cho_solve_banded(parts.factor, rhs)
 
 
 def solve(system: BorderedSystem, damping: float, tangent: Floats | None) -> tuple[Floats, Floats]:
@@ -192,9 +187,7 @@ def solve(system: BorderedSystem, damping: float, tangent: Floats | None) -> tup
     # Half of the work of `eliminate` is enough: with A = Uᵀ U and H = U⁻ᵀ [B g], Hᵀ H holds Bᵀ A⁻¹ B and Bᵀ A⁻¹ g.
     half_solved = np.empty((factor.shape[1], len(system.gradient_cameras) + 1), order="F")
     half_solved[:, :-1], half_solved[:, -1] = system.border, system.gradient_path
-    half_solved, _ = dtbtrs(
-        factor, half_solved, trans="T", overwrite_b=True
-    )  # fails only on a zero diagonal, which the factor never has
+    half_solved = solve_upper_transposed(factor, half_solved)
     gram = half_solved.T @ half_solved
     rhs = gram[:-1, -1] - system.gradient_cameras
     matrix = system.corner - gram[:-1, :-1] + damping * np.diag(np.diag(system.corner)) + 1e-12 * np.eye(len(rhs))
@@ -202,15 +195,15 @@ def solve(system: BorderedSystem, damping: float, tangent: Floats | None) -> tup
         cameras = np.linalg.solve(matrix, rhs)
     else:
         cameras = tangent @ np.linalg.solve(tangent.T @ matrix @ tangent, tangent.T @ rhs)
-    path = cho_solve_banded((factor, False), system.gradient_path + system.border @ cameras, check_finite=False)
-    return -np.asarray(path), np.asarray(cameras)
+    path = cho_solve_banded(factor, system.gradient_path + system.border @ cameras)
+    return -path, np.asarray(cameras)
 
 
 def _damped_cholesky(band: Floats, damping: float) -> Floats:
     """Cholesky band of A, damped on its diagonal. Raises LinAlgError if not positive definite."""
     band = band.copy()
     band[-1] += damping * band[-1] + regularisation(band[-1])
-    return np.asarray(cholesky_banded(band, check_finite=False))
+    return cholesky_banded(band)
 
 
 def regularisation(diagonal: Floats) -> Floats:

@@ -6,15 +6,14 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.special import erf
 
 from hub.bundle.bordered_system import BAND, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
-from hub.trajectory.splines import SUPPORT
+from hub.trajectory.splines import SUPPORT, weighted_sums
 from protocols.geometry import so3
+from protocols.geometry.compiled import erf
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
@@ -239,10 +238,6 @@ def path_std(cov: Covariance, state: AdjustmentState, label: int, time: Floats) 
     index, weights, _ = state.trajectories[label].basis.weights(time)
     first = base + 3 * index
     block, inside = first // BAND, first % BAND
-    columns = index[:, None] + np.arange(SUPPORT)
-    pointers = SUPPORT * np.arange(len(time) + 1)
-    shape = (len(time), state.trajectories[label].basis.size)
-    basis_matrix = csr_array((weights.ravel(), columns.ravel(), pointers), shape=shape)
     out = np.zeros((len(time), 3))
     for axis in range(3):
         for a in range(SUPPORT):
@@ -250,7 +245,7 @@ def path_std(cov: Covariance, state: AdjustmentState, label: int, time: Floats) 
                 values = cov.blocks[block, inside + 3 * a + axis, inside + 3 * b + axis]
                 out[:, axis] += weights[:, a] * weights[:, b] * values
         sensitivity = cov.a_inv_b[base + axis : base + 3 * state.trajectories[label].basis.size : 3]
-        a_inv_b = basis_matrix @ sensitivity
+        a_inv_b = weighted_sums(sensitivity, index, weights)
         out[:, axis] += ((a_inv_b @ cov.free) * a_inv_b).sum(axis=1)
     return equivalent_std(np.sqrt(np.maximum(out, 0.0)))
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from hub.bundle.problem import AdjustmentState, CorrelatedNoise, Problem
 from hub.bundle.residuals import predict
+from hub.trajectory.banded import solve_tridiagonal
 from protocols.geometry.types import Floats
 
 _MAX_ROWS = 6000
@@ -78,9 +78,8 @@ def fit_maximum_likelihood(parts: list[tuple[Floats, Floats]]) -> tuple[float, f
             # log |white I + correlated| of n samples, by the matrix determinant lemma
             logdet -= 2.0 * float(np.log(1.0 / (share * process.innovation)).sum())
             band[1] += 1.0 / white
-            factor = cholesky_banded(band, check_finite=False)
-            logdet += 4.0 * float(np.log(factor[1]).sum()) + 2.0 * len(time) * np.log(white)
-            smooth = cho_solve_banded((factor, False), residual / white, check_finite=False)
+            smooth, pivots = solve_tridiagonal(band[1], band[0, 1:], residual / white)
+            logdet += 2.0 * float(np.log(pivots).sum()) + 2.0 * len(time) * np.log(white)
             squares += float((residual * (residual - smooth)).sum()) / white
             count += 2 * len(time)
         variance = squares / count

@@ -12,8 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.sparse import csr_array
 
 from hub.bundle.adjustment import apply_step, gauge_tangent
 from hub.bundle.bordered_system import PathBlocks, add_row_sums
@@ -24,6 +22,7 @@ from hub.bundle.normal_equations import camera_priors
 from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, CorrelatedNoise, Problem, TrackObservations
 from hub.bundle.residuals import evaluate_residuals, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, smoothness_cost, smoothness_terms
+from hub.trajectory.banded import cho_solve_banded, cholesky_banded
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT
 from protocols.geometry.types import Floats, Ints
@@ -64,19 +63,23 @@ class _NoiseBlock:
     """Used rows (n,) of one camera and label, and the knots (m,) of their correlated error.
 
     knots: on the camera's clock [s]. interval: (n,) index of the knot before each row. knot_weights: (n, 2) weights of
-    that knot and the next one in a row's error. interpolation: (n, m) the same as a matrix. precision: (2, m) upper
-    band of the process. factor: Cholesky band of that precision plus the rows' information. white_information:
-    information of a row's white noise [1/px²].
+    that knot and the next one in a row's error. precision: (2, m) upper band of the process. factor: Cholesky band of
+    that precision plus the rows' information. white_information: information of a row's white noise [1/px²].
     """
 
     rows: TrackObservations
     knots: Floats
     interval: Ints
     knot_weights: Floats
-    interpolation: csr_array
     precision: Floats
     factor: Floats
     white_information: Floats
+
+    def knot_sums(self, values: Floats) -> Floats:
+        """(m, k) what values (n, k) of the rows come to at the knots."""
+        out = np.zeros((len(self.knots), values.shape[1]))
+        add_row_sums(out, self.knot_weights, self.interval[:, None] + np.arange(2), values)
+        return out
 
 
 def solve_gls(
@@ -173,10 +176,6 @@ def _noise_block(rows: TrackObservations, count: int, noise: CorrelatedNoise) ->
     interval = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, count - 2)
     share = (time - knots[interval]) / (knots[1] - knots[0])
     knot_weights = np.column_stack([1.0 - share, share])
-    pointers = 2 * np.arange(len(time) + 1)
-    interpolation = csr_array(
-        (knot_weights.ravel(), np.column_stack([interval, interval + 1]).ravel(), pointers), shape=(len(time), count)
-    )
     # Between two knots the process deviates from the line: mean variance of the bridge.
     width, correlated_std = float(knots[1] - knots[0]), float(noise.correlated_std[rows.camera])
     bridge_variance = correlated_std**2 * min(width / (3.0 * float(noise.time_constant[rows.camera])), 1.0)
@@ -189,9 +188,8 @@ def _noise_block(rows: TrackObservations, count: int, noise: CorrelatedNoise) ->
         knots,
         interval,
         knot_weights,
-        interpolation,
         precision,
-        cholesky_banded(both, check_finite=False),
+        cholesky_banded(both),
         white_information,
     )
 
@@ -221,8 +219,8 @@ def _cost(
         evaluation = evaluate_residuals(part.rows, state.cameras[part.rows.camera], state.trajectories[part.rows.label])
         total += _GROSS_ERROR_COST * float(np.count_nonzero(~evaluation.valid))
         residual = np.where(evaluation.valid, evaluation.residual, 0.0)
-        weighted_residual = part.interpolation.T @ (residual * part.white_information).T
-        noise_estimate = cho_solve_banded((part.factor, False), weighted_residual, check_finite=False)
+        weighted_residual = part.knot_sums((residual * part.white_information).T)
+        noise_estimate = cho_solve_banded(part.factor, weighted_residual)
         total += float((part.white_information * residual**2).sum()) - float((weighted_residual * noise_estimate).sum())
     return float(total)
 
@@ -262,7 +260,7 @@ def _step(
         gram = part.precision + _knot_information(part.interval, part.knot_weights, weight, len(part.knots))
         for axis in range(2):
             at = slice(first_knot, first_knot + len(part.knots))
-            knots = part.interpolation.T @ np.ascontiguousarray(weighted[axis, 3:].T)
+            knots = part.knot_sums(weighted[axis, 3:].T)
             border[at, camera_columns], gradient[at] = knots[:, :-1], knots[:, -1]
             entries.add_band(gram, first_knot)
             entries.add_cross_terms(
@@ -354,7 +352,7 @@ def _solve_banded(normal: SparseEntries, order: Ints, right: Floats) -> Floats:
     """Solution (n, k) of a symmetric system that is banded once its unknowns are permuted to ``order`` (n,)."""
     band = normal.band(order)
     band[-1] += 1e-12 * float(band[-1].max(initial=1.0))
-    factor = cholesky_banded(band, overwrite_ab=True, check_finite=False)
+    factor = cholesky_banded(band)
     ordered = np.empty_like(right, order="F")
     ordered[order] = right
-    return np.asarray(cho_solve_banded((factor, False), ordered, overwrite_b=True, check_finite=False)[order])
+    return cho_solve_banded(factor, ordered, overwrite=True)[order]

@@ -14,8 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve_banded
-from scipy.special import chdtri
 
 from hub.bundle.adjustment import apply_step, estimate_noise, gauge_tangent
 from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, cho_solve_path, eliminate
@@ -37,6 +35,8 @@ from hub.bundle.problem import (
 )
 from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
+from hub.trajectory.banded import cho_solve_banded
+from protocols.geometry.compiled import chdtri
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.rig import MAX_READOUT_S
 
@@ -371,7 +371,7 @@ class _Linearised:
         border = border_block(seen.index, seen.weights, cross[:3, None] * after, len(system.gradient_path))
         corner = np.zeros((len(columns), len(times)))
         corner[mine] = cross[4:] @ after.T
-        solved = cho_solve_banded((self.parts.factor, False), border)
+        solved = cho_solve_banded(self.parts.factor, border)
         coupling = corner - system.border.T @ solved
         score = after @ (weighted * seen.residual).sum(axis=0) - solved.T @ system.gradient_path
         score -= coupling.T @ (self.covariance @ self.gradient)

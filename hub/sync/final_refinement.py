@@ -14,9 +14,10 @@ from hub.sync.lag_uncertainty import estimate_lag_uncertainty, recentred
 from hub.sync.samples import Samples, autocorrelation
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import SmoothTrack
-from hub.two_view.refinement import FINAL_WIDTH, NoiseModel, PointPairs, RefinementResult, refine
+from hub.two_view.refinement import FINAL_WIDTH, NoiseModel, PointPairs, RefinementResult, refine, symmetric_inverse
 from hub.two_view.relative_pose import RelativePose, TwoViewGeometry, five_point, homogeneous, in_front, sampson
 from protocols.geometry import so3
+from protocols.geometry.order_statistics import median
 from protocols.geometry.types import Floats
 
 LTS_INLIER_PX = 10.0
@@ -52,7 +53,7 @@ def refine_and_test(
     samples = Samples(a, b, fit.offset, s, s.final_samples)
     if lts:
         samples.keep_inliers(fit.geometry.matrix, fit.rate, fit.offset, LTS_INLIER_PX)
-    sigma = [max(float(np.median([t.sigma for t in one])), 0.1 / one[0].focal) for one in (a, b)]
+    sigma = [max(median(np.array([t.sigma for t in one])), 0.1 / one[0].focal) for one in (a, b)]
     misfit = max(1.0, fit.residual_px / (0.5 * (sigma[0] * a[0].focal + sigma[1] * b[0].focal)))
     noise = NoiseModel(sigma[0] * misfit, sigma[1] * misfit, s.rate_prior_std)
     inverse_rate = 1.0 / fit.rate
@@ -81,7 +82,8 @@ def refine_and_test(
         rotation_std=float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))) if has_pose else 0.0,
         rate_prior_std=rate_prior_std,
     )
-    speed = float(np.nanmedian(np.linalg.norm(samples.interpolate_b((samples.time - last.offset) / rate)[1], axis=1)))
+    speeds = np.hypot(*samples.interpolate_b((samples.time - last.offset) / rate)[1].T)
+    speed = median(speeds[np.isfinite(speeds)])
     a_pixel = 1.0 / max(speed * b[0].focal, 1e-9)
     lag_limit = min(max(s.max_lag_std, a_pixel), s.max_slow_lag_std)
     certain_lag = fit.log10_false_alarm is not None and fit.log10_false_alarm < s.certain_lag_log10_false_alarm
@@ -146,18 +148,20 @@ def rotation_bound(pairs: PointPairs, matrix: Floats, noise: NoiseModel) -> floa
     ``m^T (M - limit N) m <= 0``, whatever their starts; M is what is left when the change of the lag is free. To turn a
     rotation by w turns the essential matrix by w / 2 at least, however the direction follows.
     """
-    a, b = homogeneous(pairs.a), homogeneous(pairs.b)
+    a, b = homogeneous(pairs.a).T, homogeneous(pairs.b).T
     residual = sampson(matrix, pairs.a, pairs.b, noise.sigma_a, noise.sigma_b)
-    weight = (1.0 / (1.0 + (residual / FINAL_WIDTH) ** 2))[:, None]
-    columns = [b[:, :, None] * a[:, None, :], pairs.velocity_b[:, :, None] * a[:, None, :]]
-    rows = np.concatenate([column.reshape(len(a), -1) for column in columns], axis=1)
-    moments, in_image = (weight * rows).T @ rows, np.diag([1.0, 1.0, 0.0])
-    norm = noise.sigma_b**2 * np.kron(in_image, (weight * a).T @ a)
-    norm += noise.sigma_a**2 * np.kron((weight * b).T @ b, in_image)
+    weight = 1.0 / (1.0 + (residual / FINAL_WIDTH) ** 2)
+    rows = (np.concatenate([b, pairs.velocity_b.T])[:, None] * a).reshape(-1, len(residual))
+    moments, blocks = (weight * rows) @ rows.T, np.zeros((3, 3, 3, 3))
+    of_a, of_b = noise.sigma_b**2 * ((weight * a) @ a.T), noise.sigma_a**2 * ((weight * b) @ b.T)
+    for k in range(2):  # the coordinates in the image are noisy, the third is not
+        blocks[k, :, k] += of_a
+        blocks[:, k, :, k] += of_b
+    norm = blocks.reshape(9, 9)
     start = matrix.ravel() / np.linalg.norm(matrix)
     cost = start @ moments[:9, :9] @ start / (start @ norm @ start)
-    limit = cost + LIKELIHOOD_MARGIN * (2.0 * float(autocorrelation(residual).sum()) - 1.0) / len(a)
-    free = moments[:9, 9:] @ np.linalg.pinv(moments[9:, 9:], hermitian=True) @ moments[9:, :9]
+    limit = cost + LIKELIHOOD_MARGIN * (2.0 * float(autocorrelation(residual).sum()) - 1.0) / len(residual)
+    free = moments[:9, 9:] @ symmetric_inverse(moments[9:, 9:]) @ moments[9:, :9]
     value, vector = np.linalg.eigh(moments[:9, :9] - free - limit * norm)
     if value[1] <= 0.0:
         return np.inf
@@ -169,7 +173,7 @@ def _with_rate_prior(
     samples: Samples, found: RefinementResult, noise: NoiseModel, fixed_geometry: bool
 ) -> tuple[RefinementResult, Floats, float]:
     """The fit, with a typical rate prior if the motion does not determine the rate; its covariance and prior std."""
-    covariance: Floats = np.asarray(np.linalg.pinv(found.normal, hermitian=True))
+    covariance = symmetric_inverse(found.normal)
     autocorrelation_time = samples.autocorrelation_time(found)
     if abs(found.inverse_rate - 1.0) >= _MIN_RATE_SIGNIFICANCE * np.sqrt(autocorrelation_time * covariance[-1, -1]):
         return found, covariance, noise.rate_prior_std
@@ -178,7 +182,7 @@ def _with_rate_prior(
     typical = _refine_finally(samples, found.geometry, found.intercept, 1.0, inflated, fixed_geometry=fixed_geometry)
     if typical is None:
         return found, covariance, noise.rate_prior_std
-    return typical, np.asarray(np.linalg.pinv(typical.normal, hermitian=True) / autocorrelation_time), _TYPICAL_RATE_STD
+    return typical, symmetric_inverse(typical.normal) / autocorrelation_time, _TYPICAL_RATE_STD
 
 
 def _test_sensitivity(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.fft import irfft, rfft
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import SmoothTrack
+from protocols.geometry import kernels
+from protocols.geometry.order_statistics import median, quantile
 from protocols.geometry.types import Bools, Floats, Ints
 
 _MONOMIALS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -52,8 +55,7 @@ class GridTrack:
 
 def fast_image_speed(track: SmoothTrack) -> float:
     """Image speed [px/s] of a track: its 90 % quantile."""
-    speed = track.at(track.time, 1)
-    return float(np.quantile(np.sqrt(speed[:, 0] ** 2 + speed[:, 1] ** 2), 0.9)) * track.focal
+    return quantile(np.hypot(*track.point_and_velocity(track.time)[1].T), 0.9) * track.focal
 
 
 def scan_step(speed_px: float, s: PairSettings) -> float:
@@ -68,20 +70,22 @@ def grid_tracks(tracks: Sequence[SmoothTrack], step: float, sigma_px: float) -> 
     begin = float(np.floor(min(track.basis.begin for track in tracks) / step) * step)
     end = max(track.basis.end for track in tracks)
     time = begin + step * np.arange(int(np.ceil((end - begin) / step)) + 1, dtype=np.float64)
-    points = np.stack([track.at(time) for track in tracks])
-    focal = tracks[0].focal
-    speed = np.stack([np.linalg.norm(track.at(time, 1), axis=1) for track in tracks]) * focal
-    present = np.asarray(np.isfinite(points).all(axis=2))
+    both = [track.point_and_velocity(time) for track in tracks]
+    points, focal = np.stack([one.T for one, _ in both]), tracks[0].focal  # (labels, 2, n)
+    speed = np.stack([np.hypot(*velocity.T) for _, velocity in both]) * focal
+    present = np.asarray(np.isfinite(speed))
     # Labels are rarely independent: n of them count as sqrt(n).
     share = len(tracks) ** -0.25  # a moment has a's weight times b's
     weight = np.where(present, share * speed / (speed + _HALF_WEIGHT_SPEED_PX), 0.0)
-    points = np.where(present[:, :, None], points, 0.0)
+    points = np.where(present[:, None], points, 0.0)
     total = max(float(weight.sum()), 1e-9)
-    centre = (weight[:, :, None] * points).sum(axis=(0, 1)) / total
-    variance = float((weight * ((points - centre) ** 2).sum(axis=2)).sum()) / total / 2.0
+    centre = np.einsum("kn,kin->i", weight, points) / total
+    points -= centre[:, None]
+    variance = float(np.einsum("kn,kin,kin->", weight, points, points)) / total / 2.0
     scale = np.sqrt(max(variance, 1e-12))
     transform = np.array([[1 / scale, 0, -centre[0] / scale], [0, 1 / scale, -centre[1] / scale], [0, 0, 1.0]])
-    return GridTrack(begin, step, (points - centre) / scale, weight, sigma_px / focal / scale, transform)
+    points /= scale
+    return GridTrack(begin, step, points.transpose(0, 2, 1), weight, sigma_px / focal / scale, transform)
 
 
 def most_active_window(track: GridTrack, seconds: float) -> GridTrack:
@@ -110,6 +114,7 @@ class LagScan:
     cost: Floats
 
 
+@cache
 def fast_length(least: int) -> int:
     """The smallest length of 2, 3 and 5 as factors, no less than ``least``: for the FFT of real numbers."""
     found = 1 << (least - 1).bit_length()
@@ -188,11 +193,11 @@ class PairMoments:
         """Mean squared distance over the squared noise (m,) under a given ``m_aᵀ F m_b = 0`` at lags ``which``."""
         theta = to_grid_coordinates(matrix, self.a, self.b).reshape(3, 3)
         plane = np.diag([1.0, 1.0, 0.0])
-        misfit = np.zeros((len(_MONOMIALS), len(_MONOMIALS)))
-        np.add.at(misfit, (_MONOMIAL_OF_A, _MONOMIAL_OF_B), np.outer(theta, theta))
-        of_a, of_b = np.zeros(len(_MONOMIALS)), np.zeros(len(_MONOMIALS))
-        np.add.at(of_b, MONOMIAL_INDEX, self.a.sigma**2 * theta.T @ plane @ theta)
-        np.add.at(of_a, MONOMIAL_INDEX, self.b.sigma**2 * theta @ plane @ theta.T)
+        of_both, each = (len(_MONOMIALS) * _MONOMIAL_OF_A + _MONOMIAL_OF_B).ravel(), MONOMIAL_INDEX.ravel()
+        misfit = np.bincount(of_both, np.outer(theta, theta).ravel(), len(_MONOMIALS) ** 2)
+        misfit = misfit.reshape(len(_MONOMIALS), -1)
+        of_b = np.bincount(each, (self.a.sigma**2 * theta.T @ plane @ theta).ravel())
+        of_a = np.bincount(each, (self.b.sigma**2 * theta @ plane @ theta.T).ravel())
         chosen = self.moment_sums(which)
         noise = of_b @ chosen[5] + of_a @ chosen[:, 5]
         total = np.maximum(chosen[5, 5], 1e-9)
@@ -226,6 +231,8 @@ def smallest_eigenvalues(moments: Floats, sigma_a: float, sigma_b: float) -> Flo
     By inverse iteration over all lags at once. An eigenvalue is at most a few per cent too large where the next one is
     nearly as small, that is where no geometry is distinguished at that lag anyway.
     """
+    if kernels.AVAILABLE:
+        return kernels.smallest_eigenvalues(moments, sigma_a, sigma_b, _ITERATIONS, _MIN_ORTHOGONAL)
     scaled = moments / np.maximum(moments[5, 5], 1e-9)
     factor, pivots = _ldl_factors(_eliminate_constant(scaled))
     noise_a, noise_b = (sigma_b**2 * scaled[:, 5])[MONOMIAL_INDEX], (sigma_a**2 * scaled[5])[MONOMIAL_INDEX]
@@ -374,7 +381,8 @@ def ranked_minima(
     """Candidate lags and their scores, best first: support [s] times the log of the median cost over the lag's."""
     cost = scan.cost
     with np.errstate(invalid="ignore"):
-        minimum: Bools = np.isfinite(cost)
+        known = np.isfinite(cost)
+        minimum: Bools = known.copy()
         minimum[1:] &= ~(cost[1:] > cost[:-1])
         minimum[:-1] &= cost[:-1] <= cost[1:]
     if lag_window is not None:
@@ -384,9 +392,9 @@ def ranked_minima(
     chosen: list[tuple[float, int]] = []
     for level in np.unique(octave):
         members = where[octave == level]
-        median = max(float(np.median(cost[np.isfinite(cost) & (scan.support >= 2.0**level)])), 1e-9)
+        typical = max(median(cost[known & (scan.support >= 2.0**level)]), 1e-9)
         for index in members[np.argsort(cost[members], kind="stable")][:candidates_per_octave]:
-            rank = scan.support[index] * np.log(median / max(float(cost[index]), 0.05) + 1.0)
+            rank = scan.support[index] * np.log(typical / max(float(cost[index]), 0.05) + 1.0)
             chosen.append((-float(rank), int(index)))
     chosen.sort()
     return np.array([index for _, index in chosen], dtype=np.int64), np.array([-rank for rank, _ in chosen])

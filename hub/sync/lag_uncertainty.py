@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.sync.samples import Samples, autocorrelation
-from hub.two_view.refinement import FINAL_WIDTH, RefinementResult
-from hub.two_view.relative_pose import RelativePose, homogeneous
+from hub.two_view.refinement import FINAL_WIDTH, RefinementResult, symmetric_inverse
+from hub.two_view.relative_pose import RelativePose
+from protocols.geometry.order_statistics import median
 from protocols.geometry.types import Bools, Floats
 
 _LENS_STD = (0.015, 0.012, 0.012, 0.02)
@@ -80,7 +81,7 @@ def estimate_lag_uncertainty(
     parameters = _Parameters(found.geometry, found.intercept, found.inverse_rate, np.zeros(len(_CONSIDER_STD)))
     all_samples = np.ones(samples.count, dtype=np.bool_)
     residual, jacobian = _residuals(samples, parameters, sigma, all_samples)
-    scale = max(float(np.median(np.abs(residual))) / 0.6745, 1e-9)
+    scale = max(median(np.abs(residual)) / 0.6745, 1e-9)
     prior = np.concatenate([np.zeros(_INTERCEPT + 1), [rate_prior_std**-2], _CONSIDER_STD**-2])
     weight = _cauchy_weight(residual, FINAL_WIDTH * scale)
     inflation = _autocorrelation_inflation(
@@ -110,7 +111,7 @@ def _autocorrelation_inflation(
     rho = autocorrelation(residual)
     inflated_scale = scale * np.sqrt(max(2.0 * float(rho.sum()) - 1.0, 1.0))
     weighted = jacobian * weight[:, None]
-    covariance = np.linalg.pinv(weighted.T @ jacobian / inflated_scale**2 + np.diag(prior), hermitian=True)[_INTERCEPT]
+    covariance = symmetric_inverse(weighted.T @ jacobian / inflated_scale**2 + np.diag(prior))[_INTERCEPT]
     influence = weighted @ covariance * (scale / inflated_scale**2)  # change of the lag per residual
     variance = influence @ influence + 2.0 * sum(
         float(one) * float(influence[lag:] @ influence[:-lag]) for lag, one in enumerate(rho[1:], start=1)
@@ -123,7 +124,7 @@ def _consider_std(jacobian: Floats, weight: Floats, prior: Floats) -> float:
     estimated = _INVERSE_RATE + 1
     weighted = jacobian * weight[:, None]
     normal = weighted.T @ jacobian
-    covariance = np.linalg.pinv(normal[:estimated, :estimated] + np.diag(prior[:estimated]), hermitian=True)
+    covariance = symmetric_inverse(normal[:estimated, :estimated] + np.diag(prior[:estimated]))
     systematic = covariance[_INTERCEPT] @ normal[:estimated, estimated:] * _CONSIDER_STD
     return float(np.sqrt(covariance[_INTERCEPT, _INTERCEPT] + systematic @ systematic))
 
@@ -156,7 +157,7 @@ def _estimate_with_lenses(
             damping *= 8.0
             if damping > _MAX_DAMPING:
                 break
-    return parameters, float(np.sqrt(np.linalg.pinv(normal, hermitian=True)[_INTERCEPT, _INTERCEPT]))
+    return parameters, float(np.sqrt(symmetric_inverse(normal)[_INTERCEPT, _INTERCEPT]))
 
 
 def _residuals(
@@ -170,34 +171,37 @@ def _residuals(
     height_b = np.nan_to_num(samples.interpolate_b(time)[0][:, 1])
     b, speed = samples.interpolate_b(time + readout_a * samples.points[:, 1] - readout_b * height_b)
     present = np.isfinite(b[:, 0]) & use
-    a, b, speed, centred_time = samples.points[present], b[present], speed[present], centred_time[present]
+    # Coordinates first, rows last: numpy is slow along axes of length two or three.
+    a, b, speed = (one.T.compress(present, axis=1) for one in (samples.points, b, speed))
     true_a, true_b = _with_lens_errors(a, parameters.lens_errors[:4]), _with_lens_errors(b, parameters.lens_errors[4:8])
     matrix = parameters.pose.matrix
-    line_a, line_b = homogeneous(true_b) @ matrix, homogeneous(true_a) @ matrix.T
-    variance = noise[0] ** 2 * (line_a[:, :2] ** 2).sum(axis=1) + noise[1] ** 2 * (line_b[:, :2] ** 2).sum(axis=1)
+    line_a, line_b = matrix.T @ true_b, matrix @ true_a
+    variance = noise[0] ** 2 * np.square(line_a[:2]).sum(axis=0) + noise[1] ** 2 * np.square(line_b[:2]).sum(axis=0)
     inverse_noise = 1.0 / np.sqrt(np.maximum(variance, 1e-30))
-    jacobian = np.empty((len(a), _INVERSE_RATE + 1 + len(_CONSIDER_STD)))
-    products = homogeneous(true_b)[:, :, None] * homogeneous(true_a)[:, None, :]
-    jacobian[:, :_POSE_DOF] = products.reshape(-1, 9) @ parameters.pose.tangents().reshape(_POSE_DOF, 9).T
-    jacobian[:, _INTERCEPT] = (line_b[:, :2] * speed).sum(axis=1)
-    jacobian[:, _INVERSE_RATE] = jacobian[:, _INTERCEPT] * centred_time
-    jacobian[:, 7:11] = _lens_jacobian(a, line_a)
-    jacobian[:, 11:15] = _lens_jacobian(b, line_b)
-    jacobian[:, 15] = jacobian[:, _INTERCEPT] * a[:, 1]
-    jacobian[:, 16] = -jacobian[:, _INTERCEPT] * b[:, 1]
-    return (homogeneous(true_b) * line_b).sum(axis=1) * inverse_noise, jacobian * inverse_noise[:, None]
+    jacobian = np.empty((_INVERSE_RATE + 1 + len(_CONSIDER_STD), a.shape[1]))
+    products = (true_b[:, None] * true_a).reshape(9, -1)
+    jacobian[:_POSE_DOF] = parameters.pose.tangents().reshape(_POSE_DOF, 9) @ products
+    jacobian[_INTERCEPT] = (line_b[:2] * speed).sum(axis=0)
+    jacobian[_INVERSE_RATE] = jacobian[_INTERCEPT] * centred_time[present]
+    jacobian[7:11] = _lens_jacobian(a, line_a)
+    jacobian[11:15] = _lens_jacobian(b, line_b)
+    jacobian[15] = jacobian[_INTERCEPT] * a[1]
+    jacobian[16] = -jacobian[_INTERCEPT] * b[1]
+    return (true_b * line_b).sum(axis=0) * inverse_noise, (jacobian * inverse_noise).T
 
 
 def _with_lens_errors(points: Floats, lens_errors: Floats) -> Floats:
-    """Normalised points (n, 2) corrected for ``lens_errors`` (4,) of the intrinsics they were computed with."""
-    corrected = (points - lens_errors[1:3]) * np.exp(-lens_errors[0])
-    return np.asarray(corrected * (1.0 - lens_errors[3] * (corrected**2).sum(axis=1, keepdims=True)))
+    """Homogeneous points (3, n) of normalised ones (2, n), corrected for the ``lens_errors`` (4,) of their lens."""
+    corrected = (points - lens_errors[1:3, None]) * np.exp(-lens_errors[0])
+    out = np.ones((3, points.shape[1]))
+    out[:2] = corrected * (1.0 - lens_errors[3] * np.square(corrected).sum(axis=0))
+    return out
 
 
 def _lens_jacobian(points: Floats, line: Floats) -> Floats:
-    """Derivatives (n, 4) of the distances from lines (n, 3) by the four lens errors, to first order."""
-    variance = (points * line[:, :2]).sum(axis=1)
-    return -np.column_stack([variance, line[:, 0], line[:, 1], variance * (points**2).sum(axis=1)])
+    """Derivatives (4, n) of the distances of points (2, n) from lines (3, n) by the lens errors, to first order."""
+    variance = (points * line[:2]).sum(axis=0)
+    return -np.stack([variance, line[0], line[1], variance * np.square(points).sum(axis=0)])
 
 
 def _cauchy_weight(residual: Floats, width: float) -> Floats:

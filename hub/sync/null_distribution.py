@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri, gammainc, gammaln
 
 from hub.sync.lag_scan import (
     MONOMIAL_INDEX,
@@ -25,6 +24,8 @@ from hub.sync.lag_scan import (
     to_grid_coordinates,
 )
 from hub.trajectory.image_tracks import SmoothTrack
+from protocols.geometry.compiled import chdtri, gammainc, gammaln
+from protocols.geometry.order_statistics import median, quantile
 from protocols.geometry.types import Floats, Ints
 
 COST_FLOOR = 0.04
@@ -120,8 +121,8 @@ def fit_null_distribution(
 
 def _fit_chi_square(costs: Floats) -> NullDistribution:
     logs = np.log(costs + COST_FLOOR)
-    median = float(np.median(logs))
-    return NullDistribution(median, _dof_from_spread(median - float(np.quantile(logs, _LOW_QUANTILE))), len(costs))
+    middle = median(logs)
+    return NullDistribution(middle, _dof_from_spread(middle - quantile(logs, _LOW_QUANTILE)), len(costs))
 
 
 def _stretch_costs(
@@ -133,8 +134,9 @@ def _stretch_costs(
     starts = [_stretch_starts(track.weight.shape[1], length) for track in (a, b)]
     if not len(starts[0]) or not len(starts[1]):
         return np.zeros(0)
-    parts_a = [monomials(a)[:, :, i : i + length] for i in starts[0]]
-    parts_b = [monomials(b)[:, :, j : j + length] for j in starts[1]]
+    every_a, every_b = monomials(a), monomials(b)
+    parts_a = [every_a[:, :, i : i + length] for i in starts[0]]
+    parts_b = [every_b[:, :, j : j + length] for j in starts[1]]
     lags = (a.begin + a.step * starts[0])[:, None] - (b.begin + b.step * starts[1])[None, :]
     moments = np.einsum("ilpn,jlqn->ijpq", np.stack(parts_a), np.stack(parts_b), optimize=True)
     weight = moments[:, :, 5, 5]
@@ -178,5 +180,5 @@ def _dof_from_spread(spread: float) -> float:
 
 def bandwidth(track: SmoothTrack) -> float:
     """Bandwidth [Hz] of a track's motion: of the flat speed spectrum with the same RMS acceleration over RMS speed."""
-    speed, acceleration = track.at(track.time, 1), track.at(track.time, 2)
+    speed, acceleration = track.point_and_velocity(track.time)[1], track.at(track.time, 2)
     return float(np.sqrt(3.0 * (acceleration**2).mean() / max(float((speed**2).mean()), 1e-30)) / (2.0 * np.pi))

@@ -45,6 +45,7 @@ from hub.trajectory.image_tracks import SmoothTrack
 from hub.two_view import relative_pose
 from hub.two_view.refinement import NoiseModel, RefinementResult, refine
 from hub.two_view.relative_pose import FundamentalMatrix, RelativePose, TwoViewGeometry
+from protocols.geometry.order_statistics import median
 from protocols.geometry.types import Floats
 
 _MIN_SAMPLES = 12  # more than the seven unknowns
@@ -428,7 +429,7 @@ class _PairSearch:
     ) -> RefinementResult | None:
         """The best of the refined initial geometries of `_refine_candidate`; None if none can be refined."""
         s, a = self.s, self.a
-        own = min(1.0, min(float(np.median([t.sigma_px for t in one])) for one in (a, b)) / s.sigma_px) ** 2
+        own = min(1.0, min(median(np.array([t.sigma_px for t in one])) for one in (a, b)) / s.sigma_px) ** 2
         best: RefinementResult | None = None
         repeats = 0
         for count, (geometry, lower_bound) in enumerate(

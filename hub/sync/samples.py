@@ -13,6 +13,8 @@ from hub.trajectory.image_tracks import SmoothTrack
 from hub.two_view import relative_pose
 from hub.two_view.refinement import PointPairs, RefinementResult
 from hub.two_view.relative_pose import TwoViewGeometry
+from protocols.geometry import kernels
+from protocols.geometry.order_statistics import median
 from protocols.geometry.types import Bools, Floats, Ints
 
 _MAX_INTERVAL_RATIO = 5.0  # times the median interval: longer ones are pauses
@@ -38,6 +40,8 @@ class Samples:
         # The same fraction of every label, spread over its time.
         thinned = [
             rows[np.linspace(0, len(rows) - 1, round(fraction * len(rows))).round().astype(np.int64)]
+            if fraction < 1.0
+            else rows
             for rows in rows_per_label
         ]
         self.label = np.concatenate([np.full(len(rows), k) for k, rows in enumerate(thinned)])
@@ -68,20 +72,35 @@ class Samples:
 
     def _recount(self) -> None:
         self.count = len(self.time)
-        self.centre = float(np.median(self.time)) if self.count else 0.0
+        self.centre = median(self.time) if self.count else 0.0
+        self.centred_time = self.time - self.centre
+        self.points = np.asfortranarray(self.points)  # numpy is slow along axes of length two
+        self._compiled: kernels.SampledTracks | None = None
+
+    @property
+    def compiled(self) -> kernels.SampledTracks | None:
+        """The samples for the compiled kernels."""
+        if self._compiled is None and kernels.AVAILABLE and self.count:
+            rows = np.bincount(self.label, minlength=len(self.b)).tolist()
+            splines = [(track.basis.table, track.polynomials) for track in self.b]
+            self._compiled = kernels.SampledTracks(self.points, self.centred_time, rows, splines)
+        return self._compiled
 
     def _moving_rows(self, a: SmoothTrack, b: SmoothTrack, offset: float) -> Ints:
         margin = 0.5
         inside = (a.time - offset > b.basis.begin - margin) & (a.time - offset < b.basis.end + margin)
-        speed = np.linalg.norm(a.at(a.time, 1), axis=1) * a.focal
+        speed = np.hypot(*a.point_and_velocity(a.time)[1].T) * a.focal
         return np.flatnonzero(inside & (speed > 0.5 * self.settings.min_speed_px))
 
     def interpolate_b(self, time: Floats) -> tuple[Floats, Floats]:
         """Points and velocities [1/s] of b, (n, 2) each, at b's times (n,) of the samples; NaN in gaps."""
-        if len(self.b) == 1:
-            return self.b[0].point_and_velocity(time)
-        points, velocities = np.full((len(time), 2), np.nan), np.full((len(time), 2), np.nan)
-        for k, track in enumerate(self.b):
+        return self._interpolate(self.b, time)
+
+    def _interpolate(self, tracks: Sequence[SmoothTrack], time: Floats) -> tuple[Floats, Floats]:
+        if len(tracks) == 1:
+            return tracks[0].point_and_velocity(time)
+        points, velocities = np.full((2, len(time)), np.nan).T, np.full((2, len(time)), np.nan).T
+        for k, track in enumerate(tracks):
             mine = self.label == k
             points[mine], velocities[mine] = track.point_and_velocity(time[mine])
         return points, velocities
@@ -91,12 +110,12 @@ class Samples:
         return self.points, self.interpolate_b((self.time - offset) / rate)[0]
 
     def __call__(self, inverse_rate: float, intercept: float) -> PointPairs:
-        centred_time = self.time - self.centre
-        b, speed = self.interpolate_b(inverse_rate * centred_time + intercept)
+        b, speed = self.interpolate_b(inverse_rate * self.centred_time + intercept)
         present = np.isfinite(b[:, 0])
         if present.all():
-            return PointPairs(self.points, b, speed, centred_time)
-        return PointPairs(self.points[present], b[present], speed[present], centred_time[present])
+            return PointPairs(self.points, b, speed, self.centred_time)
+        a, b, speed = (one.T.compress(present, axis=1).T for one in (self.points, b, speed))
+        return PointPairs(a, b, speed, self.centred_time[present])
 
     def autocorrelation_time(self, result: RefinementResult) -> float:
         """Integrated autocorrelation time of the residuals [samples]: the number of samples per effective sample."""
@@ -106,31 +125,26 @@ class Samples:
 
     def evaluate(self, cost: float, rate: float, offset: float, geometry: TwoViewGeometry) -> PairFit:
         """The alignment ``t_a = rate * t_b + offset`` with quality figures, over the samples where both tracks move."""
-        a = self.points
-        b, speed = self.interpolate_b((self.time - offset) / rate)
-        present = np.isfinite(b).all(axis=1)
+        b, velocity_b = self.interpolate_b((self.time - offset) / rate)
+        smooth, velocity_a = self._interpolate(self.a, self.time)
         focal_a, focal_b = self.a[0].focal, self.b[0].focal
-        speed_b = np.linalg.norm(speed, axis=1) * focal_b
-        speed_a = np.concatenate(
-            [
-                np.linalg.norm(track.at(self.time[self.label == k], 1), axis=1) * focal_a
-                for k, track in enumerate(self.a)
-            ]
-        )
-        with np.errstate(invalid="ignore"):
-            moving: Bools = present & (speed_a > self.settings.min_speed_px) & (speed_b > self.settings.min_speed_px)
-        count = int(moving.sum())
+        least = self.settings.min_speed_px
+        with np.errstate(invalid="ignore"):  # where b is not present
+            moving: Bools = np.hypot(*velocity_a.T) * focal_a > least
+            moving &= np.hypot(*velocity_b.T) * focal_b > least
+        a, smooth, b = (one.T.compress(moving, axis=1).T for one in (self.points, smooth, b))
+        count = len(a)
         if count < 8:
             return PairFit(rate, offset, geometry, cost, np.inf, 0.0, 0.0, 0.0, 0.0, self.centre, 0.0)
         sigma_a, sigma_b = self.settings.sigma_px / focal_a, self.settings.sigma_px / focal_b
-        distance = np.abs(relative_pose.sampson(geometry.matrix, a[moving], b[moving], sigma_a, sigma_b))
-        smooth = np.concatenate([track.at(self.time[self.label == k]) for k, track in enumerate(self.a)])
-        smoothed = np.abs(relative_pose.sampson(geometry.matrix, smooth[moving], b[moving], sigma_a, sigma_b))
+        distance = np.abs(relative_pose.sampson(geometry.matrix, a, b, sigma_a, sigma_b))
+        smoothed = relative_pose.sampson(geometry.matrix, smooth, b, sigma_a, sigma_b)
         # The inlier limit follows the tracks' noise, not the fit's residual: a wrong geometry must not widen it.
-        track_noise = max(float(np.median([track.sigma_px for track in tracks])) for tracks in (self.a, self.b))
+        track_noise = max(median(np.array([track.sigma_px for track in tracks])) for tracks in (self.a, self.b))
         limit = max(3.0 * track_noise, 3.0) / self.settings.sigma_px
         inlier = distance < limit
-        front = relative_pose.in_front(geometry, a[moving][inlier], b[moving][inlier])
+        inlier_a, inlier_b = (one.T.compress(inlier, axis=1).T for one in (a, b))
+        front = relative_pose.in_front(geometry, inlier_a, inlier_b)
         seconds = float(count) * self.seconds_per_sample
         inliers = float(inlier.mean())
         return PairFit(
@@ -138,22 +152,22 @@ class Samples:
             offset=offset,
             geometry=geometry,
             cost=cost,
-            residual_px=float(np.median(distance)) / 0.6745 * self.settings.sigma_px,
+            residual_px=median(distance) / 0.6745 * self.settings.sigma_px,
             inliers=inliers,
             in_front=float(front.mean()) if len(front) else 0.0,
             support=seconds * inliers,
             moving_overlap=seconds,
-            mid_time=float(np.median(self.time[moving])),
-            parallax=relative_pose.parallax(geometry, a[moving], b[moving]),
+            mid_time=median(self.time[moving]),
+            parallax=relative_pose.parallax(geometry, a, b),
             track_noise_px=track_noise,
             misfit=float((smoothed[inlier] ** 2).mean()) if inlier.any() else np.inf,
-            planar_residual_px=_planar_residual_px(a[moving][inlier] * focal_a, b[moving][inlier] * focal_b),
+            planar_residual_px=_planar_residual_px(inlier_a * focal_a, inlier_b * focal_b),
         )
 
 
 def autocorrelation(residual: Floats) -> Floats:
     """Autocorrelation (k,) of residuals (n,) by lag in samples, from lag 0 up to the last significant one."""
-    limit = _CLIP * float(np.median(np.abs(residual))) / 0.6745
+    limit = _CLIP * median(np.abs(residual)) / 0.6745
     residual = np.clip(residual, -limit, limit)
     variance = max(float(np.mean(residual**2)), 1e-300)
     out = [1.0]
@@ -167,8 +181,9 @@ def autocorrelation(residual: Floats) -> Floats:
 
 def _mean_interval(time: Floats) -> float:
     """Mean interval [s] of a track's times (n,) without pauses; dropped frames lengthen it."""
-    steps = np.diff(time)
-    return float(steps[steps <= _MAX_INTERVAL_RATIO * np.median(steps)].mean())
+    steps = time[1:] - time[:-1]
+    short = steps[steps <= _MAX_INTERVAL_RATIO * median(steps)]
+    return float(short.sum()) / len(short)
 
 
 def _planar_residual_px(a: Floats, b: Floats) -> float:

@@ -13,7 +13,9 @@ from typing import TypeAlias
 import numpy as np
 
 from hub.trajectory.discrete import SampledTrack
-from hub.trajectory.splines import SplineBasis, fit_spline, split_at_gaps, weighted_sums
+from hub.trajectory.splines import SplineBasis, fit_spline, weighted_sums
+from protocols.geometry import kernels
+from protocols.geometry.order_statistics import median, quantile
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.observations import Track as RawTrack
 
@@ -60,7 +62,7 @@ class SmoothTrack:
     discontinuities: Floats = field(default_factory=lambda: np.zeros(0))
     """(k,) times [s] at which the detector probably switched to another object."""
     polynomials: Floats = field(init=False)
-    """(size - 3, 4, 2) of the spline: refinements evaluate it hundreds of times."""
+    """(4, 2, size - 3) of the spline: refinements evaluate it hundreds of times."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "polynomials", self.basis.polynomials(self.control))
@@ -115,7 +117,7 @@ def smooth_track(
     t, x = shifted[rows], normalised[rows]
     std = np.ones(len(rows)) if relative_std is None else relative_std[rows]
     good = neighbour_test(t, x, floor=_MIN_OUTLIER_PX / focal)
-    interval = float(np.median(np.diff(t)))
+    interval = median(np.diff(t))
     gap = max(BRIDGED_GAP_S, BRIDGED_INTERVALS * interval)
     discontinuities = _discontinuities(t, x, good)
     best: _SplineFit | None = None
@@ -178,7 +180,7 @@ def neighbour_test(time: Floats, points: Floats, floor: float) -> Bools:
     for one_sided in (False, True):
         score = _neighbour_score(time, points, good, one_sided)
         # The 40 % quantile lies among the inliers even with 40 % outliers.
-        limit = max(floor, 6.0 * float(np.quantile(score, 0.4)))
+        limit = max(floor, 6.0 * quantile(score, 0.4))
         again = np.asarray(score <= limit)
         if again.all() or again.sum() < 2 * _NEIGHBOURS:
             return again
@@ -189,6 +191,8 @@ def neighbour_test(time: Floats, points: Floats, floor: float) -> Bools:
 def _neighbour_score(time: Floats, points: Floats, good: Bools, one_sided: bool) -> Floats:
     """20 % quantile (n,) of each point's distances from lines through two good neighbours."""
     rows = np.flatnonzero(good)
+    if kernels.AVAILABLE:
+        return kernels.neighbour_scores(time, points, rows, one_sided, _NEIGHBOUR_QUANTILE)
     t, x = time[rows], points[rows]
     before = np.searchsorted(rows, np.arange(len(time))) - 1
     after = before + 1 + good
@@ -235,10 +239,10 @@ def _discontinuities(t: Floats, x: Floats, good: Bools) -> Floats:
             break
         at, pos = t[rows], x[rows]
         dt = np.diff(at)
-        velocity = np.diff(pos, axis=0) / dt[:, None]
+        velocity = (pos[1:] - pos[:-1]).T / dt
         # Acceleration between i and i + 1, from the velocity before and from the velocity after.
-        acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=1) / (0.5 * (dt[1:] + dt[:-1]))
-        limit = _DISCONTINUITY_FACTOR * float(np.quantile(acceleration, 0.9))
+        acceleration = np.hypot(*(velocity[:, 1:] - velocity[:, :-1])) / (0.5 * (dt[1:] + dt[:-1]))
+        limit = _DISCONTINUITY_FACTOR * quantile(acceleration, 0.9)
         where = np.flatnonzero(np.minimum(acceleration[:-1], acceleration[1:]) > limit) + 1
         # A part of a few points is outliers rather than another object; the test is repeated without them.
         lengths = np.diff(np.r_[0, where + 1, len(rows)])
@@ -263,37 +267,36 @@ def _robust_fit(
     """Spline fit with iterative outlier rejection, on stretches split at long gaps and discontinuities."""
     inlier = good.copy()
     basis, control, sigma = None, None, np.inf
-    gap, row_weight = max(gap, _BRIDGED_KNOTS * spacing), std**-2.0
+    gap, row_weight = max(gap, _BRIDGED_KNOTS * spacing), 1.0 / (std * std)
     part_index = np.searchsorted(discontinuities, t)
     for step in range(6):
-        inlier &= _in_stretches(t, inlier, gap, part_index)
-        count = int(inlier.sum())
+        inlier, begins, ends, counts = _stretches(t, inlier, gap, part_index)
+        count = int(counts.sum())
         if count < 2 * _MIN_POINTS:
             return None
-        begins, ends = split_at_gaps(t[inlier], gap, part_index[inlier])
         basis = SplineBasis.spanning(begins, ends, spacing)
         rows = basis.weights(t)  # once, for the fit and for its residuals
         control = fit_spline(basis, rows, x, np.where(inlier, row_weight, 0.0), stiffness)
-        error = weighted_sums(control, *rows[:2]) - x
-        residual = np.where(rows[2], np.hypot(error[:, 0], error[:, 1]) / std, np.nan)
-        counts = np.diff(np.searchsorted(t[inlier], np.r_[begins, np.inf]))
+        error = weighted_sums(control, *rows[:2]).T - x.T
+        residual = np.hypot(error[0], error[1])
+        residual /= std
+        residual[~rows[2]] = np.inf
         degrees_of_freedom = _degrees_of_freedom(counts, basis.intervals + 3, stiffness)
         n = float(count)
         left = max(n - degrees_of_freedom, 0.02 * n)
         # Median of a Rayleigh variable: 1.1774 sigma.
-        sigma = max(_MIN_SIGMA_PX / focal, float(np.median(residual[inlier])) / 1.1774 * np.sqrt(n / left))
-        with np.errstate(invalid="ignore"):
-            again = residual < max(_OUTLIER_SIGMAS * sigma * (2.0 if step == 0 else 1.0), _MIN_OUTLIER_PX / focal)
-        if np.array_equal(again, inlier):
+        sigma = max(_MIN_SIGMA_PX / focal, median(residual[inlier]) / 1.1774 * np.sqrt(n / left))
+        again = residual < max(_OUTLIER_SIGMAS * sigma * (2.0 if step == 0 else 1.0), _MIN_OUTLIER_PX / focal)
+        if (again == inlier).all():
             break
         inlier = again
     if basis is None or control is None:
         return None
     squared = np.minimum(residual[inlier], _OUTLIER_SIGMAS * sigma) ** 2
-    kept = float(inlier.sum())
-    score = float(squared.mean()) * (kept / max(kept - degrees_of_freedom, 0.02 * kept)) ** 2
+    kept = float(len(squared))
+    score = float(squared.sum()) / kept * (kept / max(kept - degrees_of_freedom, 0.02 * kept)) ** 2
     # A spacing that rejects many points must not win by fitting the rest well.
-    score *= (float(good.sum()) / kept) ** 2
+    score *= (float(np.count_nonzero(good)) / kept) ** 2
     return _SplineFit(score, basis, control, inlier, sigma)
 
 
@@ -302,27 +305,31 @@ def _degrees_of_freedom(points: Ints, control_counts: Ints, stiffness: float) ->
 
     points, controls: (s,) of each stretch.
     """
-    # The squared third difference has the gain |2 sin(w / 2)|^6. With fewer points than control points a track has
-    # no frequencies above the points' own; a control point then has points / controls rows.
-    rows = np.minimum(points / control_counts, 1.0)[:, None]
-    phase = np.linspace(0.0, np.pi, 65)[1:] * rows
-    share = 1.0 / (
-        1.0 + stiffness * (2.0 * np.sin(0.5 * phase)) ** 6 / np.maximum(points / control_counts, 1e-9)[:, None]
-    )
+    # With fewer points than control points a track has no frequencies above the points' own; a control point then has
+    # points / controls rows.
+    ratio = points / control_counts
+    gain = _GAIN if ratio.min() >= 1.0 else (2.0 * np.sin(0.5 * _PHASE * np.minimum(ratio, 1.0)[:, None])) ** 6
+    share = 1.0 / (1.0 + stiffness * gain / np.maximum(ratio, 1e-9)[:, None])
     return float((np.minimum(points, control_counts) * share.mean(axis=1)).sum())
 
 
-def _in_stretches(t: Floats, inlier: Bools, gap: float, part_index: Ints) -> Bools:
-    """Inliers in stretches of at least _MIN_POINTS points."""
-    out = np.zeros(len(t), dtype=np.bool_)
+_PHASE = np.linspace(0.0, np.pi, 65)[1:]
+_GAIN = (2.0 * np.sin(0.5 * _PHASE)) ** 6
+"""Gain of the squared third difference at each phase from one control point to the next."""
+
+
+def _stretches(t: Floats, inlier: Bools, gap: float, part_index: Ints) -> tuple[Bools, Floats, Floats, Ints]:
+    """Inliers in stretches of at least _MIN_POINTS points; begins, ends and numbers of points of the stretches."""
     rows = np.flatnonzero(inlier)
-    if len(rows) == 0:
-        return out
-    cut = (np.diff(t[rows]) > gap) | (np.diff(part_index[rows]) > 0)
-    for part in np.split(rows, np.flatnonzero(cut) + 1):
-        if len(part) >= _MIN_POINTS:
-            out[part] = True
-    return out
+    at, part = t[rows], part_index[rows]
+    cuts = np.flatnonzero((at[1:] - at[:-1] > gap) | (part[1:] > part[:-1])) + 1
+    edges = np.concatenate([[0], cuts, [len(rows)]])
+    counts = edges[1:] - edges[:-1]
+    long = counts >= _MIN_POINTS
+    if not long.all():
+        inlier = np.zeros(len(t), dtype=np.bool_)
+        inlier[rows[np.repeat(long, counts)]] = True
+    return inlier, at[edges[:-1][long]], at[edges[1:][long] - 1], counts[long]
 
 
 def smooth_only(tracks: Mapping[str, ImageTrack]) -> dict[str, SmoothTrack]:

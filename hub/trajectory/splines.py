@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg.lapack import dpbsv
 
+from hub.trajectory.banded import solve_banded
+from protocols.geometry import kernels
 from protocols.geometry.types import Bools, Floats, Ints
 
 SUPPORT = 4
@@ -34,10 +35,14 @@ class SplineBasis:
     """(s,) knot interval of each stretch [s]: ``spacing``, or slightly less where a stretch is covered exactly."""
     offsets: Ints = field(init=False)
     """(s,) index of each stretch's first control point."""
+    table: Floats = field(init=False)
+    """(4, s) starts, widths, intervals and offsets, for the compiled kernels."""
 
     def __post_init__(self) -> None:
         each = self.intervals + 3
         object.__setattr__(self, "offsets", np.cumsum(each) - each)
+        table = np.array([self.starts, self.widths, self.intervals, self.offsets], dtype=np.float64)
+        object.__setattr__(self, "table", table)
 
     @classmethod
     def covering(cls, begins: Floats, ends: Floats, spacing: float) -> SplineBasis:
@@ -75,20 +80,22 @@ class SplineBasis:
         return np.concatenate([start + width * (np.arange(count + 3) - 1.0) for start, width, count in each])
 
     def locate(self, time: Floats, extrapolation: float = 0.0) -> tuple[Ints, Floats, Bools, Floats]:
-        """First control point (n,), parameter u in the knot interval (n,), inside a stretch (n,), interval width (n,).
+        """First control point (n,), parameter u in the knot interval (n,), inside a stretch (n,), interval width.
+
+        The width is (n,), or (1,) where all are alike.
 
         extrapolation: knot intervals by which a stretch's end polynomials are extended; there u is outside [0, 1].
         """
+        if len(self.starts) == 1 and len(time):  # no gaps: most tracks, and half of the time
+            last = float(self.intervals[0])
+            place = (time - self.starts[0]) / self.widths[0]
+            if np.minimum.reduce(place) >= 0.0 and np.maximum.reduce(place) <= last + extrapolation + 1e-9:  # no NaN
+                interval = np.minimum(place, last - 1.0).astype(np.int64)
+                place -= interval
+                return interval, place, np.ones(len(place), dtype=np.bool_), self.widths
         known = np.isfinite(time)
         if not known.all():
             time = np.where(known, time, self.starts[0])
-        if len(self.starts) == 1:  # no gaps: most tracks, and half of the time
-            last = float(self.intervals[0])
-            place = (time - self.starts[0]) / self.widths[0]
-            known &= (place >= -extrapolation) & (place <= last + extrapolation + 1e-9)
-            interval = np.clip(place, 0.0, last - 1.0).astype(np.int64)
-            place -= interval
-            return interval, place, known, np.full(len(place), self.widths[0])
         stretch = np.searchsorted(self.starts - extrapolation * self.widths, time, side="right") - 1
         inside = known & (stretch >= 0)
         np.maximum(stretch, 0, out=stretch)
@@ -105,6 +112,9 @@ class SplineBasis:
 
         derivative: 0 value, 1 first, 2 second derivative by time.
         """
+        if kernels.AVAILABLE and derivative < 2 and len(self.starts):
+            index, weights, slopes, inside = kernels.spline_weights(self.table, time, 0.0, derivative == 1)
+            return index, (slopes if derivative else weights).T, inside
         index, u, inside, width = self.locate(time)
         weights = basis_weights(u, derivative)
         if derivative:
@@ -116,6 +126,9 @@ class SplineBasis:
 
         extrapolation: as in `locate`.
         """
+        if kernels.AVAILABLE and len(self.starts):
+            index, weights, slopes, inside = kernels.spline_weights(self.table, time, extrapolation, True)
+            return index, weights.T, slopes.T, inside
         index, u, inside, width = self.locate(time, extrapolation)
         return index, basis_weights(u), basis_weights(u, 1) / width[:, None], inside
 
@@ -128,17 +141,28 @@ class SplineBasis:
         return values
 
     def polynomials(self, control: Floats) -> Floats:
-        """(size - 3, 4, d) coefficients of 1, u, u², u³ in the knot interval that begins at each control point."""
-        return np.asarray(
-            _POWERS @ np.lib.stride_tricks.sliding_window_view(control, SUPPORT, axis=0).transpose(0, 2, 1)
-        )
+        """(4, d, size - 3) coefficients of 1, u, u², u³ in the knot interval that begins at each control point."""
+        size = len(control) - SUPPORT + 1
+        points = np.stack([control[k : k + size].T for k in range(SUPPORT)])
+        return np.asarray((_POWERS @ points.reshape(SUPPORT, -1)).reshape(points.shape))
 
     def evaluate_with_derivatives(self, polynomials: Floats, time: Floats) -> tuple[Floats, Floats]:
         """Values and first derivatives, (n, d) each, at ``time``, of a spline's `polynomials`; NaN outside."""
+        if kernels.AVAILABLE and len(self.starts):
+            values, slopes = kernels.spline_values(self.table, time, polynomials)
+            return values.T, slopes.T
         index, u, inside, width = self.locate(time)
-        constant, first, second, third = polynomials.take(index, axis=0).transpose(1, 2, 0)
-        values = ((third * u + second) * u + first) * u + constant
-        slopes = ((3.0 * third * u + 2.0 * second) * u + first) / width
+        constant, first, second, third = polynomials.take(index, axis=2)
+        slopes = third * u  # Horner's scheme for both, in place
+        values = slopes + second
+        slopes += values
+        values *= u
+        values += first
+        slopes *= u
+        slopes += values
+        slopes /= width
+        values *= u
+        values += constant
         if not inside.all():
             values[:, ~inside] = np.nan
             slopes[:, ~inside] = np.nan
@@ -180,6 +204,8 @@ def basis_weights(u: Floats, derivative: int = 0) -> Floats:
 
 def weighted_sums(control: Floats, index: Ints, weights: Floats) -> Floats:
     """Sums (n, d) of four control points from ``index`` (n,) on, of ``control`` (size, d), with ``weights`` (n, 4)."""
+    if kernels.AVAILABLE:
+        return kernels.weighted_sums(control, index, weights.T).T
     out = np.empty((control.shape[1], len(index)))
     # One coordinate at a time: numpy is slow along axes of length two or three.
     for values, column in zip(out, np.ascontiguousarray(control.T), strict=True):
@@ -207,23 +233,23 @@ def fit_spline(
     stiffness: weight of squared third differences relative to one row; it only bridges empty intervals.
     """
     index, weights, inside = rows
-    used = np.where(inside, row_weight, 0.0)
-    bands = normal_bands(index, weights, used, basis.size)
+    used, size = np.where(inside, row_weight, 0.0), basis.size
+    if kernels.AVAILABLE:
+        bands, target = kernels.spline_normal((index, weights.T), used, values, basis.table, stiffness, size)
+        return solve_banded(bands, target.T)
+    bands = normal_bands(index, weights, used, size)
     intervals = basis.interval_starts()
     third = (-1.0, 3.0, -3.0, 1.0)
     for a in range(SUPPORT):
         for b in range(a, SUPPORT):
             bands[SUPPORT - 1 - (b - a), intervals + b] += stiffness * third[a] * third[b]
     bands[-1] += 1e-12
-    target = np.zeros((basis.size, values.shape[1]))
+    right = np.zeros((size, values.shape[1]))
     for k in range(SUPPORT):
         weighted = used * weights[:, k]
         for d in range(values.shape[1]):
-            target[:, d] += np.bincount(index + k, weighted * values[:, d], minlength=basis.size)
-    _, control, info = dpbsv(bands, target, overwrite_ab=1, overwrite_b=1)  # scipy's own wrapper takes as long again
-    if info:
-        raise np.linalg.LinAlgError("the normal matrix of a spline is not positive definite")
-    return np.asarray(control)
+            right[:, d] += np.bincount(index + k, weighted * values[:, d], minlength=size)
+    return solve_banded(bands, right)
 
 
 def split_at_gaps(time: Floats, max_gap: float, part: Ints | None = None) -> tuple[Floats, Floats]:

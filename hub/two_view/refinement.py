@@ -10,10 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
-from hub.two_view.relative_pose import RelativePose, TwoViewGeometry
+from hub.two_view.relative_pose import FundamentalMatrix, RelativePose, TwoViewGeometry
+from protocols.geometry import kernels
+from protocols.geometry.compiled import dgesv
 from protocols.geometry.types import Floats
 
 SEARCH_WIDTH = 2.0
@@ -22,6 +26,7 @@ FINAL_WIDTH = 4.0
 """Final width [sigma] of the Cauchy weight in a final fit: 0.996 of the efficiency of least squares."""
 _TOLERANCE = 1e-4
 """Relative decrease of the cost at which it has converged."""
+_NO_INFORMATION = 1e-15  # relative size of eigenvalues that are rounding errors
 _MIN_ROWS = 12  # twice the six unknowns of a relative pose and a lag
 
 
@@ -29,8 +34,8 @@ _MIN_ROWS = 12  # twice the six unknowns of a relative pose and a lag
 class PointPairs:
     """Corresponding normalised points.
 
-    a, b: (n, 2). velocity_b: (n, 2) derivative of b by b's time [1/s]. centred_time: (n,) time of a minus the
-    samples' centre [s].
+    a, b: (n, 2), fastest where a coordinate lies together. velocity_b: (n, 2) derivative of b by b's time [1/s].
+    centred_time: (n,) time of a minus the samples' centre [s].
     """
 
     a: Floats
@@ -71,6 +76,13 @@ class RefinementResult:
     normal: Floats
 
 
+def symmetric_inverse(matrix: Floats) -> Floats:
+    """Pseudoinverse of a symmetric matrix (n, n)."""
+    values, vectors = np.linalg.eigh(matrix)
+    known = np.abs(values) > _NO_INFORMATION * np.abs(values).max()
+    return np.asarray((vectors * np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)) @ vectors.T)
+
+
 def refine(
     sampler: Sampler,
     geometry: TwoViewGeometry,
@@ -90,19 +102,31 @@ def refine(
     final_width: of the Cauchy weight [sigma].
     """
     damping, width = 1e-3, max(3.0 * initial_misfit, final_width)
-    rows = _linearise(sampler, geometry, inverse_rate, intercept, noise, fixed_geometry)
-    if rows is None:
+    compiled: kernels.SampledTracks | None = getattr(sampler, "compiled", None)
+    if compiled is not None:
+        is_pose, free, numbers = _packed(geometry)
+        state = np.concatenate([*numbers, [inverse_rate, intercept]])
+        noises, limits = (noise.sigma_a, noise.sigma_b, noise.rate_prior_std), (_MIN_ROWS, iterations, _TOLERANCE)
+        kind, widths = (is_pose, 0 if fixed_geometry else free), (width, final_width)
+        cost, normal = kernels.refine_alignment(compiled, state, kind, noises, widths, limits)
+        left, right, (inverse_rate, intercept) = state[:9].reshape(3, 3), state[9:18].reshape(3, 3), state[21:].tolist()
+        moved = RelativePose(left, state[18:21]) if is_pose else FundamentalMatrix(left, right, float(state[18]))
+        return RefinementResult(cost, inverse_rate, intercept, moved, normal) if np.isfinite(cost) else None
+    system_at = partial(_linearise, sampler, noise=noise, fixed_geometry=fixed_geometry)
+    rows, last_gain = system_at(geometry, inverse_rate, intercept), 0.0
+    system = rows(width)
+    if not np.isfinite(system[2]):
         return None
-    system, last_gain = _normal_equations(rows, inverse_rate, width, noise), 0.0
     for _ in range(iterations):
         normal, gradient, cost = system
-        damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
-        step: Floats = np.asarray(np.linalg.solve(damped, -gradient), dtype=np.float64)
+        damped = normal.copy()
+        damped.reshape(-1)[:: len(normal) + 1] += damping * normal.diagonal() + 1e-12
+        step: Floats = np.asarray(dgesv(damped, -gradient)[2])  # numpy's solution, without its checks
         trial_geometry = geometry if fixed_geometry else geometry.retract(step[:-2])
         trial_map = inverse_rate + float(step[-1]), intercept + float(step[-2])
-        trial_rows = _linearise(sampler, trial_geometry, *trial_map, noise, fixed_geometry)
-        trial = None if trial_rows is None else _normal_equations(trial_rows, trial_map[0], width, noise)
-        if trial_rows is not None and trial is not None and trial[2] < cost:
+        trial_rows = system_at(trial_geometry, *trial_map)
+        trial = trial_rows(width)
+        if trial[2] < cost:
             geometry, (inverse_rate, intercept), rows = trial_geometry, trial_map, trial_rows
             damping = max(damping / 5.0, 1e-9)
             if width == final_width:
@@ -118,10 +142,14 @@ def refine(
                 break
             continue
         width = max(final_width, 0.5 * width)
-        system = _normal_equations(rows, inverse_rate, width, noise)  # another width changes the weights only
+        system = rows(width)  # another width changes the weights only
     if not 0.5 < inverse_rate < 2.0 or width > final_width:
         return None
     return RefinementResult(system[2], inverse_rate, intercept, geometry, system[0])
+
+
+_System: TypeAlias = tuple[Floats, Floats, float]
+"""Normal matrix and gradient by local geometry, intercept, inverse rate; mean robust cost, infinite without overlap."""
 
 
 def _linearise(
@@ -129,52 +157,58 @@ def _linearise(
     geometry: TwoViewGeometry,
     inverse_rate: float,
     intercept: float,
+    *,
     noise: NoiseModel,
     fixed_geometry: bool,
-) -> tuple[Floats, Floats] | None:
-    """Residuals (n,) in units of the noise and their Jacobian (n, k + 2); None without overlap.
+) -> Callable[[float], _System]:
+    """The system at a state, by the width of the Cauchy weights."""
+    tangents = np.zeros((0, 3, 3)) if fixed_geometry else geometry.tangents()
+    rows = _residuals(sampler(inverse_rate, intercept), geometry.matrix, tangents, noise)
+    prior, count = 1.0 / noise.rate_prior_std**2, len(rows[0])
 
-    Parameters: the geometry's local ones (none if it is fixed), intercept, inverse rate.
-    """
-    pairs = sampler(inverse_rate, intercept)
-    count = len(pairs.a)
-    if count < _MIN_ROWS:
-        return None
-    matrix = geometry.matrix
-    line_b = pairs.a @ matrix[:, :2].T
-    line_b += matrix[:, 2]
-    line_a = pairs.b @ matrix[:2, :2]
-    line_a += matrix[2, :2]
-    variance = noise.sigma_b**2 * (line_b[:, 0] ** 2 + line_b[:, 1] ** 2)
-    variance += noise.sigma_a**2 * (line_a[:, 0] ** 2 + line_a[:, 1] ** 2)
+    def system(width: float) -> _System:
+        if count < _MIN_ROWS:
+            return np.zeros((0, 0)), np.zeros(0), np.inf
+        normal, gradient, cost = _normal_equations(rows, width)
+        normal[-1, -1] += prior
+        gradient[-1] += prior * (inverse_rate - 1.0)
+        return normal, gradient, (cost + prior * (inverse_rate - 1.0) ** 2) / count
+
+    return system
+
+
+def _packed(geometry: TwoViewGeometry) -> tuple[bool, int, list[Floats]]:
+    """Whether a geometry is a pose, its degrees of freedom, and its numbers as `kernels.refine_alignment` has them."""
+    if isinstance(geometry, RelativePose):
+        return True, 5, [geometry.rotation.ravel(), np.zeros(9), geometry.direction]
+    return False, 7, [geometry.left.ravel(), geometry.right.ravel(), np.array([geometry.angle, 0.0, 0.0])]
+
+
+def _residuals(pairs: PointPairs, matrix: Floats, tangents: Floats, noise: NoiseModel) -> tuple[Floats, Floats]:
+    """Sampson distances (n,) in units of the noise and their Jacobian (k + 2, n)."""
+    a, b = pairs.a.T, pairs.b.T
+    line_b = matrix[:, :2] @ a
+    line_b += matrix[:, 2:]
+    line_a = matrix[:2, :2].T @ b
+    line_a += matrix[2, :2, None]
+    variance = noise.sigma_b**2 * np.einsum("in,in->n", line_b[:2], line_b[:2])
+    variance += noise.sigma_a**2 * np.einsum("in,in->n", line_a, line_a)
     over = 1.0 / np.sqrt(np.maximum(variance, 1e-30))
-    residual = (pairs.b[:, 0] * line_b[:, 0] + pairs.b[:, 1] * line_b[:, 1] + line_b[:, 2]) * over
-    free = 0 if fixed_geometry else 5 if isinstance(geometry, RelativePose) else 7
-    jacobian = np.empty((count, free + 2))
-    if free:
-        products = np.empty((count, 3, 3))
-        products[:, :2, :2] = pairs.b[:, :, None] * pairs.a[:, None, :]
-        products[:, 2, :2] = pairs.a
-        products[:, :2, 2] = pairs.b
-        products[:, 2, 2] = 1.0
-        jacobian[:, :free] = products.reshape(count, 9) @ geometry.tangents().reshape(free, 9).T
-    jacobian[:, free] = line_b[:, 0] * pairs.velocity_b[:, 0] + line_b[:, 1] * pairs.velocity_b[:, 1]
-    jacobian[:, free + 1] = jacobian[:, free] * pairs.centred_time
-    jacobian *= over[:, None]
+    residual = (np.einsum("in,in->n", b, line_b[:2]) + line_b[2]) * over
+    count, free = len(residual), len(tangents)
+    jacobian, products = np.empty((free + 2, count)), np.empty((3, 3, count))
+    np.multiply(b[:, None], a, out=products[:2, :2])
+    products[2, :2], products[:2, 2], products[2, 2] = a, b, 1.0
+    np.matmul(tangents.reshape(free, 9), products.reshape(9, count), out=jacobian[:free])
+    np.einsum("in,in->n", line_b[:2], pairs.velocity_b.T, out=jacobian[free])
+    np.multiply(jacobian[free], pairs.centred_time, out=jacobian[free + 1])
+    jacobian *= over
     return residual, jacobian
 
 
-def _normal_equations(
-    rows: tuple[Floats, Floats], inverse_rate: float, width: float, noise: NoiseModel
-) -> tuple[Floats, Floats, float]:
-    """Normal matrix, gradient and mean robust cost of `_linearise`'s rows, with Cauchy weights of a width."""
+def _normal_equations(rows: tuple[Floats, Floats], width: float) -> _System:
+    """Normal matrix, gradient and robust cost of `_residuals`, with Cauchy weights of a width."""
     residual, jacobian = rows
-    ratio = (residual / width) ** 2
-    weighted = jacobian / (1.0 + ratio)[:, None]
-    normal = weighted.T @ jacobian
-    gradient = weighted.T @ residual
-    prior = 1.0 / noise.rate_prior_std**2
-    normal[-1, -1] += prior
-    gradient[-1] += prior * (inverse_rate - 1.0)
-    cost = float((width**2 * np.log1p(ratio)).sum()) + prior * (inverse_rate - 1.0) ** 2
-    return normal, gradient, cost / len(residual)
+    ratio = np.square(residual / width)
+    weighted = jacobian / (1.0 + ratio)
+    return weighted @ jacobian.T, weighted @ residual, float((width**2 * np.log1p(ratio)).sum())

@@ -6,6 +6,7 @@ The published fundamental matrix is the transpose, ``m_aᵀ F m_b = 0`` (asynchr
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -13,7 +14,8 @@ import cv2
 import numpy as np
 
 from hub.two_view.fundamental import hartley_normalisation
-from protocols.geometry import so3
+from protocols.geometry import kernels, so3
+from protocols.geometry.order_statistics import median
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
 
@@ -42,16 +44,16 @@ class RelativePose:
 
     def tangents(self) -> Floats:
         """(5, 3, 3) derivatives of ``matrix`` by the local parameters of `retract`."""
-        axes, cross = orthogonal_axes(self.direction), so3.hat(self.direction)
         out = np.empty((5, 3, 3))
-        np.matmul(cross, _GENERATORS @ self.rotation, out=out[:3])
-        np.matmul(so3.hat(axes), self.rotation, out=out[3:])
+        np.matmul(so3.hat(self.direction), _GENERATORS @ self.rotation, out=out[:3])
+        for along, axis in zip(out[3:], orthogonal_axes(self.direction), strict=True):
+            np.matmul(so3.hat(axis), self.rotation, out=along)
         return out
 
     def retract(self, step: Floats) -> RelativePose:
         """The pose after a local step (5,): rotation vector [rad], then the direction along its two tangents."""
         direction = self.direction + step[3:5] @ orthogonal_axes(self.direction)
-        return RelativePose(so3.exp(step[:3]) @ self.rotation, direction / np.linalg.norm(direction))
+        return RelativePose(so3.exp(step[:3]) @ self.rotation, direction / math.sqrt(direction @ direction))
 
     def inverse(self) -> RelativePose:
         """The relative pose of a from b."""
@@ -108,7 +110,9 @@ def relative_pose_between(a: Pose, b: Pose) -> RelativePose:
 
 def homogeneous(points: Floats) -> Floats:
     """Homogeneous coordinates (n, 3) of points (n, 2)."""
-    return np.column_stack([points, np.ones(len(points))])
+    out = np.ones((3, len(points)))
+    out[:2] = points.T
+    return out.T
 
 
 def sampson(essential: Floats, a: Floats, b: Floats, sigma_a: float, sigma_b: float) -> Floats:
@@ -116,18 +120,20 @@ def sampson(essential: Floats, a: Floats, b: Floats, sigma_a: float, sigma_b: fl
 
     Hartley and Zisserman, Multiple View Geometry, sec. 11.4.3. essential: (3, 3), ``s_bᵀ E s_a = 0``.
     """
-    ha, hb = homogeneous(a), homogeneous(b)
-    line_b, line_a = ha @ essential.T, hb @ essential
-    variance = sigma_b**2 * (line_b[:, :2] ** 2).sum(axis=1) + sigma_a**2 * (line_a[:, :2] ** 2).sum(axis=1)
-    return np.asarray((hb * line_b).sum(axis=1) / np.sqrt(np.maximum(variance, 1e-30)))
+    line_b = essential[:, :2] @ a.T + essential[:, 2:]
+    line_a = essential[:2, :2].T @ b.T + essential[2, :2, None]
+    variance = sigma_b**2 * np.einsum("in,in->n", line_b[:2], line_b[:2])
+    variance += sigma_a**2 * np.einsum("in,in->n", line_a, line_a)
+    algebraic = np.einsum("in,in->n", b.T, line_b[:2]) + line_b[2]
+    return np.asarray(algebraic / np.sqrt(np.maximum(variance, 1e-30)))
 
 
 def triangulate_midpoint(pose: RelativePose, a: Floats, b: Floats) -> tuple[Floats, Floats]:
     """Depths (n,) along the rays of a and of b, in units of the baseline, by least squares; NaN for parallel rays."""
-    ray_a, ray_b = homogeneous(a) @ pose.rotation.T, homogeneous(b)
+    ray_a, ray_b = pose.rotation @ homogeneous(a).T, homogeneous(b).T
     # baseline * direction = s_b ray_b - s_a ray_a
-    aa, bb, ab = (ray_a**2).sum(1), (ray_b**2).sum(1), (ray_a * ray_b).sum(1)
-    at, bt = ray_a @ pose.direction, ray_b @ pose.direction
+    aa, bb, ab = (np.einsum("in,in->n", one, other) for one, other in ((ray_a, ray_a), (ray_b, ray_b), (ray_a, ray_b)))
+    at, bt = pose.direction @ ray_a, pose.direction @ ray_b
     determinant = aa * bb - ab * ab
     determinant = np.where(determinant > 1e-14 * aa * bb, determinant, np.nan)
     return (ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant
@@ -146,9 +152,9 @@ def parallax(pose: TwoViewGeometry, a: Floats, b: Floats) -> float:
     """Median parallax angle [rad] of normalised points a, b (n, 2); 0 without intrinsics."""
     if isinstance(pose, FundamentalMatrix) or len(a) == 0:
         return 0.0
-    rays_a, rays_b = homogeneous(a) @ pose.rotation.T, homogeneous(b)
-    cosine = (rays_a * rays_b).sum(1) / np.linalg.norm(rays_a, axis=1) / np.linalg.norm(rays_b, axis=1)
-    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    ray_a, ray_b = pose.rotation @ homogeneous(a).T, homogeneous(b).T
+    aa, bb, ab = (np.einsum("in,in->n", one, other) for one, other in ((ray_a, ray_a), (ray_b, ray_b), (ray_a, ray_b)))
+    return math.acos(max(-1.0, min(1.0, median(ab / np.sqrt(aa * bb)))))
 
 
 def decompose_essential(essential: Floats, a: Floats, b: Floats) -> RelativePose:
@@ -159,12 +165,19 @@ def decompose_essential(essential: Floats, a: Floats, b: Floats) -> RelativePose
     u, _, vt = np.linalg.svd(essential)
     u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    options = [RelativePose(u @ w @ vt, sign * u[:, 2]) for w in (quarter, quarter.T) for sign in (1.0, -1.0)]
-    return max(options, key=lambda option: int(in_front(option, a, b).sum()))
+    options = list[tuple[int, RelativePose]]()
+    for rotation in (u @ quarter @ vt, u @ quarter.T @ vt):
+        depths = np.stack(triangulate_midpoint(RelativePose(rotation, u[:, 2]), a, b))
+        with np.errstate(invalid="ignore"):
+            for sign in (1.0, -1.0):  # the depths change their sign with the direction
+                count = int(np.count_nonzero((sign * depths > 0).all(axis=0)))
+                options.append((count, RelativePose(rotation, sign * u[:, 2])))
+    return max(options, key=lambda option: option[0])[1]
 
 
 _SYMMETRIC_INDEX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Index of each entry of a symmetric 3x3 matrix among its six upper ones."""
+_REWEIGHTINGS = 4  # of a homography: outliers have lost their weight by then
 
 
 def homography_residual(a: Floats, b: Floats) -> float:
@@ -177,13 +190,15 @@ def homography_residual(a: Floats, b: Floats) -> float:
     """
     if len(a) < 8:
         return float("nan")
+    if kernels.AVAILABLE:
+        return kernels.homography_residual(a, b, _REWEIGHTINGS) / 1.1774
     scale_a, scale_b = hartley_normalisation(a), hartley_normalisation(b)
     # Coordinates first, points last: numpy is slow along axes of length two or three.
     ha, (x, y, _) = scale_a @ homogeneous(a).T, scale_b @ homogeneous(b).T
     outer = ha[[0, 0, 0, 1, 1, 2]] * ha[[0, 1, 2, 1, 2, 2]]
     of_b = np.stack([np.ones_like(x), -x, -y, x * x + y * y], axis=1)
     weight, normal = np.ones(len(a)), np.zeros((9, 9))
-    for _ in range(4):
+    for _ in range(_REWEIGHTINGS):
         # Normal matrix of the DLT rows (ha, 0, -x ha) and (0, ha, -y ha).
         plain, by_x, by_y, by_both = (outer @ (of_b * np.square(weight)[:, None])).T[:, _SYMMETRIC_INDEX]
         normal[:3, :3] = normal[3:6, 3:6] = plain
@@ -196,7 +211,7 @@ def homography_residual(a: Floats, b: Floats) -> float:
         image = mapped[:2] / depth
         distance = np.hypot(image[0] - x, image[1] - y)
         # The algebraic error grows with the depth; division by it makes rows count by image distance.
-        weight = 1.0 / np.abs(depth) / (1.0 + (distance / max(3.0 * float(np.median(distance)), 1e-12)) ** 2)
+        weight = 1.0 / np.abs(depth) / (1.0 + (distance / max(3.0 * median(distance), 1e-12)) ** 2)
         weight /= weight.max()
     # Jacobian (2, 2, n) of the homography at each point, in units of b over units of a.
     slope = (homography[:2, :2, None] - image[:, None] * homography[2, :2, None]) / depth
@@ -208,7 +223,7 @@ def homography_residual(a: Floats, b: Floats) -> float:
     # J^T applied to the error rotated by a right angle: the adjugate of J J^T.
     along = slope[0] * error[1] - slope[1] * error[0]
     squared = 2.0 * (np.square(error).sum(axis=0) + np.square(along).sum(axis=0)) / determinant
-    return float(np.median(np.sqrt(np.maximum(squared, 0.0)))) / 1.1774 / float(scale_b[0, 0])
+    return median(np.sqrt(np.maximum(squared, 0.0))) / 1.1774 / float(scale_b[0, 0])
 
 
 def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 300) -> list[RelativePose]:
@@ -217,9 +232,8 @@ def five_point(a: Floats, b: Floats, threshold: float, seed: int, subset: int = 
     a, b: normalised points (n, 2). threshold: inlier distance in normalised coordinates. subset: largest number of
     pairs used. Empty for fewer than 8 pairs or where no matrix is found.
     """
-    rng = np.random.default_rng(seed)
     poses: list[RelativePose] = []
-    pick = rng.permutation(len(a))[:subset] if len(a) > subset else np.arange(len(a))
+    pick = np.random.default_rng(seed).permutation(len(a))[:subset] if len(a) > subset else np.arange(len(a))
     if len(pick) < 8:
         return poses
     cv2.setRNGSeed(seed)
@@ -253,10 +267,14 @@ def fundamental_from(pose: TwoViewGeometry, matrix_a: Floats, matrix_b: Floats) 
 
 def orthogonal_axes(direction: Floats) -> Floats:
     """Two unit vectors (2, 3) orthogonal to ``direction`` (3,) and to each other."""
-    x, y, z = (float(value) for value in direction)
+    x, y, z = direction.tolist()
     # Cross product with the coordinate axis least aligned with the direction.
-    least = min(range(3), key=lambda k: abs((x, y, z)[k]))
-    first = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[least]
-    length = (first[0] ** 2 + first[1] ** 2 + first[2] ** 2) ** 0.5
-    p, q, r = (value / length for value in first)
+    if abs(x) <= abs(y) and abs(x) <= abs(z):
+        p, q, r = 0.0, z, -y
+    elif abs(y) <= abs(z):
+        p, q, r = -z, 0.0, x
+    else:
+        p, q, r = y, -x, 0.0
+    length = math.sqrt(p * p + q * q + r * r)
+    p, q, r = p / length, q / length, r / length
     return np.array([[p, q, r], [y * r - z * q, z * p - x * r, x * q - y * p]])

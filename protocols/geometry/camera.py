@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from protocols.geometry import kernels
 from protocols.geometry.types import Floats
 
 _NEWTON_STEPS = 20  # a bound: it converges quadratically
@@ -105,6 +106,9 @@ class Intrinsics:
 
         normalised: (n, 2). Returns the distorted coordinates (n, 2) and their Jacobian (n, 2, 2).
         """
+        if kernels.AVAILABLE:
+            out, jacobian = kernels.brown_distortion(normalised, self.distortions)
+            return out.T, jacobian.transpose(2, 0, 1)
         k1, k2, p1, p2, k3 = self.distortions
         x, y = normalised[:, 0], normalised[:, 1]
         r2 = x * x + y * y

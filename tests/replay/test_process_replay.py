@@ -24,14 +24,17 @@ from protocols.session.calibration import read_calibration
 from protocols.topics import CALIBRATION, TARGET, TRACK
 from tests.replay import scenes
 
-# What other processors' arithmetic may change: of one machine's kernels against another's it was 4e-14 to 4e-12.
+# What other processors' arithmetic may change: of one machine's kernels against another's it was 4e-14 to 4e-12. A
+# clock's offset, 1.8e9 s, may round to the next number, 2.4e-7 s away, and with it the time of every measurement.
 MARKER_TOLERANCES = {
     "calibration.cameras.clock_rate_std": 1e-10,
-    "track.velocity_covariance": 1e-8,
-    "track_smoothed.position": 1e-9,
-    "track_smoothed.position_covariance": 1e-12,
-    "track_smoothed.velocity": 1e-8,
-    "track_smoothed.velocity_covariance": 1e-10,
+    "track.reference_time_ns": 250,
+    "track.velocity_covariance": 1e-5,
+    "track_smoothed.reference_time_ns": 250,
+    "track_smoothed.position": 1e-6,
+    "track_smoothed.position_covariance": 1e-9,
+    "track_smoothed.velocity": 1e-6,
+    "track_smoothed.velocity_covariance": 1e-7,
     **{f"calibration.cameras.{name}": 1e-6 for name in ("translation", "rotation", "position_std", "matrix")},
     "calibration.cameras.time_offset": 2e-3,  # at a clock's zero, 1.8e9 s before: 1e-12 of its rate
     "calibration.cameras.time_offset_std": 1e-7,
@@ -39,7 +42,7 @@ MARKER_TOLERANCES = {
     "calibration.cameras.rms_px": 1e-4,
     "track.position": 1e-5,
     "track.velocity": 1e-4,
-    "track.position_covariance": 1e-8,
+    "track.position_covariance": 1e-6,
 }
 # A particle filter on JPEG-compressed images: other builds of OpenCV round differently.
 TOWN_TOLERANCES = {

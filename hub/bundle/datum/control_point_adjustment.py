@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import cho_solve_banded
 
 from hub.bundle.adjustment import apply_step
 from hub.bundle.bordered_system import eliminate
@@ -13,6 +12,7 @@ from hub.bundle.gls import solve_gls
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
+from hub.trajectory.banded import cho_solve_banded
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig
@@ -49,7 +49,7 @@ def adjust_to_control_points(
     now = terms(state)
     for _ in range(_MAX_ITERATIONS):
         parts = eliminate(system)
-        path = np.asarray(cho_solve_banded((parts.factor, False), system.gradient_path, check_finite=False))
+        path = cho_solve_banded(parts.factor, system.gradient_path)
         gradient = system.gradient_cameras - system.border.T @ path + now.gradient[columns]
         rows, values = constraints(state)
         step, _ = constrained_step(

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from hub.bundle.preprocessing import PreparedSession
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import smooth_only
 from protocols.geometry.types import Ints
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 LARGE_NETWORK = 24
 """Cameras from which on pairs are chosen by overlap: up to there all of them take less than the adjustment."""
@@ -55,6 +57,8 @@ def candidate_pairs(
 
 def _overlaps(prepared: PreparedSession, clocks: Mapping[str, ExternalClockPrior]) -> csr_array[Any]:
     """(cameras, cameras) seconds in which both saw one target, to within a bin."""
+    from scipy.sparse import csr_array  # slow to import, and needed by large networks only
+
     cameras, bins = list[Ints](), list[Ints]()
     targets = {label: index for index, label in enumerate(prepared.labels)}
     for number, name in enumerate(prepared.names):

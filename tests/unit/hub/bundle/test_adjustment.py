@@ -302,10 +302,7 @@ def test_the_schur_complement_equals_the_dense_one() -> None:
     np.testing.assert_allclose(parts.reduced, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("fast", [True, False])
-def test_border_blocks_take_rows_in_any_order(fast: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not fast:  # a scipy that no longer has the function
-        monkeypatch.setattr(bordered_system, "_csc_matvecs", None)
+def test_border_blocks_take_rows_in_any_order() -> None:
     rng = np.random.default_rng(0)
     index, weights = rng.integers(0, 20, 50), rng.random((50, 4))
     blocks = rng.normal(size=(50, 3, 5))

@@ -1,0 +1,788 @@
+/* Inner loops of splines and of pair synchronisation: what numpy does in hundreds of small calls.
+
+Each function does what the numpy code does that calls it, which stays the fallback and the reference of the tests.
+Arrays are C-contiguous doubles, coordinate by coordinate, rows last. No fast-math, no fused operations: the same
+numbers on every machine. */
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+typedef int64_t integer;
+
+#define SIXTH (1.0 / 6.0)
+
+/* On processors with wider registers a loop takes fewer operations, with the same result. */
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && defined(__linux__)
+#define WIDE __attribute__((target_clones("avx2", "default")))
+#define INLINE inline __attribute__((always_inline))
+#else
+#define WIDE
+#define INLINE inline
+#endif
+
+/* hub.trajectory.splines.SplineBasis.locate for one time; 0 outside. basis: (4, stretches) starts, widths, intervals,
+   first control points. hint: the stretch of the time before. */
+static int locate(const double *basis, integer stretches, double time, double extrapolation, integer *hint,
+                  integer *index, double *u, double *width)
+{
+    const double *starts = basis, *widths = basis + stretches;
+    integer k = *hint;
+    int inside = 1;
+    if (!isfinite(time)) {
+        time = starts[0];
+        inside = 0;
+    }
+    while (k + 1 < stretches && starts[k + 1] - extrapolation * widths[k + 1] <= time) k++;
+    while (k > 0 && starts[k] - extrapolation * widths[k] > time) k--;
+    *hint = k;
+    if (starts[k] - extrapolation * widths[k] > time) inside = 0;
+    double count = basis[2 * stretches + k], place = (time - starts[k]) / widths[k];
+    if (place > count + extrapolation + 1e-9) inside = 0;
+    double low = place < 0.0 ? 0.0 : place;
+    integer interval = (integer)(low < count - 1.0 ? low : count - 1.0);
+    *index = (integer)basis[3 * stretches + k] + interval;
+    *u = place - (double)interval;
+    *width = widths[k];
+    return inside;
+}
+
+/* SplineBasis.weights_and_derivatives: index (n,), weights and, unless null, slopes (4, n), inside (n,). */
+void spline_weights(integer n, const double *time, integer stretches, const double *basis, double extrapolation,
+                    integer *index, double *weights, double *slopes, uint8_t *inside)
+{
+    integer hint = 0;
+    for (integer i = 0; i < n; i++) {
+        double u, width;
+        inside[i] = (uint8_t)locate(basis, stretches, time[i], extrapolation, &hint, index + i, &u, &width);
+        double v = 1.0 - u, square = u * u, cube = square * u;
+        weights[i] = v * v * v * SIXTH;
+        weights[n + i] = (3 * cube - 6 * square + 4) * SIXTH;
+        weights[2 * n + i] = (-3 * cube + 3 * square + 3 * u + 1) * SIXTH;
+        weights[3 * n + i] = cube * SIXTH;
+        if (!slopes) continue;
+        double over = SIXTH / width;
+        slopes[i] = -3 * v * v * over;
+        slopes[n + i] = (9 * square - 12 * u) * over;
+        slopes[2 * n + i] = (-9 * square + 6 * u + 3) * over;
+        slopes[3 * n + i] = 3 * square * over;
+    }
+}
+
+/* SplineBasis.evaluate_with_derivatives: polynomials (4, d, m); values, slopes (d, n). */
+void spline_values(integer n, const double *time, integer stretches, const double *basis, integer d, integer m,
+                   const double *polynomials, double *values, double *slopes)
+{
+    integer hint = 0, index;
+    double u, width;
+    for (integer i = 0; i < n; i++) {
+        int inside = locate(basis, stretches, time[i], 0.0, &hint, &index, &u, &width);
+        for (integer axis = 0; axis < d; axis++) {
+            const double *p = polynomials + axis * m + index;
+            double slope = p[3 * d * m] * u, value = slope + p[2 * d * m];
+            slope += value;
+            value = value * u + p[d * m];
+            slope = slope * u + value;
+            values[axis * n + i] = inside ? value * u + p[0] : NAN;
+            slopes[axis * n + i] = inside ? slope / width : NAN;
+        }
+    }
+}
+
+/* hub.trajectory.splines.weighted_sums: control (size, d), weights (4, n); out (d, n). */
+void weighted_sums(integer n, integer d, const double *control, const integer *index, const double *weights,
+                   double *out)
+{
+    for (integer i = 0; i < n; i++) {
+        const double *p = control + d * index[i];
+        for (integer axis = 0; axis < d; axis++)
+            out[axis * n + i] = weights[i] * p[axis] + weights[n + i] * p[d + axis] + weights[2 * n + i] * p[2 * d + axis]
+                                + weights[3 * n + i] * p[3 * d + axis];
+    }
+}
+
+/* The normal equations of hub.trajectory.splines.fit_spline: weights (4, n), values (n, d); bands (4, size) and target
+   (d, size), both zero before. */
+void spline_normal(integer n, const integer *index, const double *weights, const double *row_weight, integer d,
+                   const double *values, integer stretches, const double *basis, double stiffness, integer size,
+                   double *bands, double *target)
+{
+    static const double third[4] = {-1.0, 3.0, -3.0, 1.0};
+    for (integer i = 0; i < n; i++) {
+        if (row_weight[i] == 0.0) continue;
+        for (int a = 0; a < 4; a++) {
+            double used = row_weight[i] * weights[a * n + i];
+            integer row = index[i] + a;
+            for (int b = a; b < 4; b++) bands[(3 - b + a) * size + index[i] + b] += used * weights[b * n + i];
+            for (integer axis = 0; axis < d; axis++) target[axis * size + row] += used * values[d * i + axis];
+        }
+    }
+    for (integer s = 0; s < stretches; s++) {
+        integer first = (integer)basis[3 * stretches + s], last = first + (integer)basis[2 * stretches + s];
+        for (integer j = first; j < last; j++)
+            for (int a = 0; a < 4; a++)
+                for (int b = a; b < 4; b++) bands[(3 - b + a) * size + j + b] += stiffness * third[a] * third[b];
+    }
+    for (integer j = 0; j < size; j++) bands[3 * size + j] += 1e-12;
+}
+
+/* hub.bundle.bordered_system.PathBlocks.add_rows: weights (4, n), terms (2, 3 + p, n), p at most 21; added to sums
+   ((size + 4) * 10, 6), to crossed (size + 4, 3, p) and to gram (p, p). */
+WIDE void add_rows(integer n, const integer *index, const double *weights, integer p, const double *terms,
+                   double *sums, double *crossed, double *gram)
+{
+    enum { MOST = 24 };
+    const integer width = 3 + p;
+    for (integer i = 0; i < n; i++) {
+        double u[MOST], v[MOST], products[3][MOST];
+        for (integer c = 0; c < width; c++) {
+            u[c] = terms[c * n + i];
+            v[c] = terms[(width + c) * n + i];
+        }
+        for (int r = 0; r < 3; r++)
+            for (integer c = 0; c < width; c++) products[r][c] = u[r] * u[c] + v[r] * v[c];
+        double upper[6] = {products[0][0], products[0][1], products[0][2], products[1][1], products[1][2], products[2][2]};
+        double *of_pair = sums + 60 * index[i];
+        for (int a = 0; a < 4; a++) {
+            double weight = weights[a * n + i], *to = crossed + (index[i] + a) * 3 * p;
+            for (int r = 0; r < 3; r++)
+                for (integer c = 0; c < p; c++) to[r * p + c] += weight * products[r][3 + c];
+            for (int b = a; b < 4; b++, of_pair += 6) {
+                double both = weight * weights[b * n + i];
+                for (int k = 0; k < 6; k++) of_pair[k] += both * upper[k];
+            }
+        }
+        for (integer r = 0; r < p; r++)
+            for (integer c = 0; c < p; c++) gram[r * p + c] += u[3 + r] * u[3 + c] + v[3 + r] * v[3 + c];
+    }
+}
+
+/* Intrinsics.distort: normalised (2, n), coefficients k1, k2, p1, p2, k3; out (2, n), jacobian (2, 2, n). */
+WIDE void brown_distortion(integer n, const double *normalised, const double *coefficients, double *out,
+                           double *jacobian)
+{
+    const double k1 = coefficients[0], k2 = coefficients[1], p1 = coefficients[2], p2 = coefficients[3];
+    const double k3 = coefficients[4];
+    for (integer i = 0; i < n; i++) {
+        double x = normalised[i], y = normalised[n + i], r2 = x * x + y * y;
+        double radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), slope = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2);
+        double mixed = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y;
+        out[i] = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
+        out[n + i] = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
+        jacobian[i] = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x;
+        jacobian[n + i] = jacobian[2 * n + i] = mixed;
+        jacobian[3 * n + i] = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x;
+    }
+}
+
+/* The tracks of one camera, a label each. rows: where each label's rows end. */
+typedef struct {
+    integer labels;
+    const integer *ends, *stretches, *sizes;
+    const double *const *bases, *const *polynomials;
+} tracks_t;
+
+enum { BLOCK = 64, MOST_COLUMNS = 9 };
+
+/* hub.two_view.refinement: normal (k + 2, k + 2), gradient (k + 2,) and cost of Sampson distances with Cauchy weights,
+   at the time map t_b = inverse_rate * centred_time + intercept. points: (2, n) of a; tracks: of b, whose polynomials
+   are (4, 2, size). tangents: (k, 3, 3) derivatives of the matrix (3, 3). Returns the number of rows where b is. */
+WIDE static integer sampson_system(integer n, const double *points, const double *centred_time, const tracks_t *tracks,
+                       double inverse_rate, double intercept, const double *matrix, const double *tangents,
+                       integer k, double variance_a, double variance_b, double width, double *normal,
+                       double *gradient, double *cost)
+{
+    const double *m = matrix;
+    const integer columns = k + 2;
+    double sums[MOST_COLUMNS][MOST_COLUMNS + 1] = {{0.0}}, total = 0.0;
+    integer count = 0, label = 0, hint = 0, i = 0;
+    while (i < n) {
+        double ax[BLOCK], ay[BLOCK], bx[BLOCK], by[BLOCK], vx[BLOCK], vy[BLOCK], at[BLOCK], over[BLOCK], weight[BLOCK];
+        double row[MOST_COLUMNS + 1][BLOCK] = {{0.0}};
+        int many = 0;
+        for (; i < n && many < BLOCK; i++) {
+            while (i >= tracks->ends[label]) {
+                label++;
+                hint = 0;
+            }
+            integer index, size = tracks->sizes[label];
+            double u, knot, time = inverse_rate * centred_time[i] + intercept;
+            if (!locate(tracks->bases[label], tracks->stretches[label], time, 0.0, &hint, &index, &u, &knot)) continue;
+            const double *p = tracks->polynomials[label] + index;
+            double slope = p[6 * size] * u, value = slope + p[4 * size];
+            slope += value;
+            value = value * u + p[2 * size];
+            vx[many] = (slope * u + value) / knot;
+            bx[many] = value * u + p[0];
+            p += size;
+            slope = p[6 * size] * u, value = slope + p[4 * size];
+            slope += value;
+            value = value * u + p[2 * size];
+            vy[many] = (slope * u + value) / knot;
+            by[many] = value * u + p[0];
+            ax[many] = points[i];
+            ay[many] = points[n + i];
+            at[many++] = centred_time[i];
+        }
+        for (int j = 0; j < many; j++) {
+            double b0 = m[0] * ax[j] + m[1] * ay[j] + m[2], b1 = m[3] * ax[j] + m[4] * ay[j] + m[5];
+            double b2 = m[6] * ax[j] + m[7] * ay[j] + m[8];
+            double a0 = m[0] * bx[j] + m[3] * by[j] + m[6], a1 = m[1] * bx[j] + m[4] * by[j] + m[7];
+            double variance = variance_b * (b0 * b0 + b1 * b1) + variance_a * (a0 * a0 + a1 * a1);
+            over[j] = 1.0 / sqrt(variance > 1e-30 ? variance : 1e-30);
+            double residual = (bx[j] * b0 + by[j] * b1 + b2) * over[j], ratio = residual / width;
+            row[MOST_COLUMNS][j] = residual;
+            row[k][j] = (b0 * vx[j] + b1 * vy[j]) * over[j];
+            row[k + 1][j] = row[k][j] * at[j];
+            weight[j] = ratio * ratio;
+        }
+        for (integer c = 0; c < k; c++) {
+            const double *t = tangents + 9 * c;
+            for (int j = 0; j < many; j++)
+                row[c][j] = (bx[j] * (t[0] * ax[j] + t[1] * ay[j] + t[2]) + by[j] * (t[3] * ax[j] + t[4] * ay[j] + t[5])
+                             + (t[6] * ax[j] + t[7] * ay[j] + t[8])) * over[j];
+        }
+        for (int j = 0; j < many; j++) {
+            total += log1p(weight[j]);
+            weight[j] = 1.0 / (1.0 + weight[j]);
+        }
+        for (int j = 0; j < many; j++) {
+            double values[MOST_COLUMNS + 1];
+            for (integer q = 0; q <= MOST_COLUMNS; q++) values[q] = row[q][j];
+            for (integer p = 0; p < columns; p++) {
+                double weighted = values[p] * weight[j];
+                for (integer q = 0; q <= MOST_COLUMNS; q++) sums[p][q] += weighted * values[q];
+            }
+        }
+        count += many;
+    }
+    for (integer p = 0; p < columns; p++) {
+        for (integer q = 0; q < columns; q++) normal[p * columns + q] = sums[p][q];
+        gradient[p] = sums[p][MOST_COLUMNS];
+    }
+    *cost = total * width * width;
+    return count;
+}
+
+/* out = a b of (3, 3). */
+static void multiply(const double *a, const double *b, double *out)
+{
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) out[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
+}
+
+/* out = hat(w) b. */
+static void cross(const double *w, const double *b, double *out)
+{
+    const double hat[9] = {0.0, -w[2], w[1], w[2], 0.0, -w[0], -w[1], w[0], 0.0};
+    multiply(hat, b, out);
+}
+
+/* hub.two_view.relative_pose.orthogonal_axes: axes (2, 3). */
+static void orthogonal_axes(const double *d, double *axes)
+{
+    double x = d[0], y = d[1], z = d[2], p, q, r;
+    if (fabs(x) <= fabs(y) && fabs(x) <= fabs(z)) p = 0.0, q = z, r = -y;
+    else if (fabs(y) <= fabs(z)) p = -z, q = 0.0, r = x;
+    else p = y, q = -x, r = 0.0;
+    double length = sqrt(p * p + q * q + r * r);
+    p /= length, q /= length, r /= length;
+    const double both[6] = {p, q, r, y * r - z * q, z * p - x * r, x * q - y * p};
+    memcpy(axes, both, sizeof both);
+}
+
+/* protocols.geometry.so3.exp of w. */
+static void rotation_of(const double *w, double *out)
+{
+    double x = w[0], y = w[1], z = w[2], angle2 = x * x + y * y + z * z, angle = sqrt(angle2);
+    double a = angle < 1e-4 ? 1.0 - angle2 / 6.0 : sin(angle) / angle;
+    double b = angle < 1e-4 ? 0.5 - angle2 / 24.0 : (1.0 - cos(angle)) / angle2;
+    double ax = a * x, ay = a * y, az = a * z, xy = b * x * y, xz = b * x * z, yz = b * y * z;
+    const double exp[9] = {1.0 - b * (y * y + z * z), xy - az, xz + ay, xy + az, 1.0 - b * (x * x + z * z), yz - ax,
+                           xz - ay, yz + ax, 1.0 - b * (x * x + y * y)};
+    memcpy(out, exp, sizeof exp);
+}
+
+/* Gaussian elimination with partial pivoting of (n, n); the solution in right. 0 if singular. */
+static int solve(integer n, double *matrix, double *right)
+{
+    for (integer k = 0; k < n; k++) {
+        integer pivot = k;
+        for (integer i = k + 1; i < n; i++)
+            if (fabs(matrix[i * n + k]) > fabs(matrix[pivot * n + k])) pivot = i;
+        if (matrix[pivot * n + k] == 0.0) return 0;
+        for (integer j = 0; j < n && pivot != k; j++) {
+            double other = matrix[k * n + j];
+            matrix[k * n + j] = matrix[pivot * n + j];
+            matrix[pivot * n + j] = other;
+        }
+        double other = right[k];
+        right[k] = right[pivot];
+        right[pivot] = other;
+        for (integer i = k + 1; i < n; i++) {
+            double factor = matrix[i * n + k] / matrix[k * n + k];
+            for (integer j = k + 1; j < n; j++) matrix[i * n + j] -= factor * matrix[k * n + j];
+            right[i] -= factor * right[k];
+        }
+    }
+    for (integer k = n - 1; k >= 0; k--) {
+        for (integer j = k + 1; j < n; j++) right[k] -= matrix[k * n + j] * right[j];
+        right[k] /= matrix[k * n + k];
+    }
+    return 1;
+}
+
+/* A two-view geometry and a time map, as hub.two_view.refinement has them: of a relative pose left is the rotation and
+   rest the direction; of a fundamental matrix rest is the angle. */
+typedef struct {
+    double left[9], right[9], rest[3], inverse_rate, intercept;
+} alignment_t;
+
+typedef struct {
+    double normal[MOST_COLUMNS * MOST_COLUMNS], gradient[MOST_COLUMNS], cost;
+} system_t;
+
+typedef struct {
+    integer n, columns, least, calibrated;
+    const double *points, *centred_time;
+    const tracks_t *tracks;
+    double variance_a, variance_b, prior;
+} samples_t;
+
+/* left diag(first, second, 0) right. */
+static void of_rank_two(const alignment_t *at, double first, double second, double *out)
+{
+    double scaled[9];
+    for (int i = 0; i < 3; i++) {
+        scaled[3 * i] = at->left[3 * i] * first;
+        scaled[3 * i + 1] = at->left[3 * i + 1] * second;
+        scaled[3 * i + 2] = 0.0;
+    }
+    multiply(scaled, at->right, out);
+}
+
+/* `matrix` (3, 3) and `tangents` (5 or 7, 3, 3) of hub.two_view.relative_pose. */
+static void geometry_of(const alignment_t *at, integer calibrated, double *matrix, double *tangents)
+{
+    double axes[6], part[9];
+    if (calibrated) cross(at->rest, at->left, matrix);
+    else of_rank_two(at, cos(at->rest[0]), sin(at->rest[0]), matrix);
+    for (int axis = 0; axis < 3; axis++) {
+        const double unit[3] = {axis == 0, axis == 1, axis == 2};
+        if (calibrated) {
+            cross(unit, at->left, part);
+            cross(at->rest, part, tangents + 9 * axis);
+        } else {
+            const double hat[9] = {0.0, -unit[2], unit[1], unit[2], 0.0, -unit[0], -unit[1], unit[0], 0.0};
+            cross(unit, matrix, tangents + 9 * axis);
+            multiply(matrix, hat, tangents + 27 + 9 * axis);
+        }
+    }
+    if (calibrated) {
+        orthogonal_axes(at->rest, axes);
+        cross(axes, at->left, tangents + 27);
+        cross(axes + 3, at->left, tangents + 36);
+    } else {
+        of_rank_two(at, -sin(at->rest[0]), cos(at->rest[0]), tangents + 54);
+    }
+}
+
+/* `retract` of hub.two_view.relative_pose. */
+static void retract(alignment_t *at, integer calibrated, const double *step)
+{
+    double turn[9], turned[9], axes[6], length = 0.0;
+    rotation_of(step, turn);
+    multiply(turn, at->left, turned);
+    memcpy(at->left, turned, sizeof turned);
+    if (!calibrated) {
+        rotation_of(step + 3, turn);
+        multiply(at->right, turn, turned);
+        memcpy(at->right, turned, sizeof turned);
+        at->rest[0] += step[6];
+        return;
+    }
+    orthogonal_axes(at->rest, axes);
+    for (int k = 0; k < 3; k++) at->rest[k] += step[3] * axes[k] + step[4] * axes[3 + k];
+    for (int k = 0; k < 3; k++) length += at->rest[k] * at->rest[k];
+    for (int k = 0; k < 3; k++) at->rest[k] /= sqrt(length);
+}
+
+static void alignment_system(const samples_t *samples, const alignment_t *at, double width, system_t *out)
+{
+    integer k = samples->columns - 2;
+    double matrix[9], tangents[63];
+    geometry_of(at, samples->calibrated, matrix, tangents);
+    integer count = sampson_system(samples->n, samples->points, samples->centred_time, samples->tracks, at->inverse_rate,
+                                   at->intercept, matrix, tangents, k, samples->variance_a, samples->variance_b, width,
+                                   out->normal, out->gradient, &out->cost);
+    double off = at->inverse_rate - 1.0;
+    out->normal[samples->columns * samples->columns - 1] += samples->prior;
+    out->gradient[samples->columns - 1] += samples->prior * off;
+    out->cost = count < samples->least ? INFINITY : (out->cost + samples->prior * off * off) / (double)count;
+}
+
+/* hub.two_view.refinement.refine: state (23,) as alignment_t, in place; free: the geometry's parameters, 0 if it is
+   given; normal (free + 2, free + 2). Returns the cost, infinite where there is none. */
+double refine_alignment(integer n, const double *points, const double *centred_time, const tracks_t *tracks,
+                        double *state, integer calibrated, integer free_count, double variance_a, double variance_b,
+                        double prior, integer least, double width, double final_width, integer iterations,
+                        double tolerance, double *normal)
+{
+    const integer columns = free_count + 2;
+    samples_t samples = {n, columns, least, calibrated, points, centred_time, tracks, variance_a, variance_b, prior};
+    alignment_t at, trial_at;
+    system_t system, trial;
+    double damping = 1e-3, last_gain = 0.0;
+    memcpy(&at, state, sizeof at);
+    alignment_system(&samples, &at, width, &system);
+    if (!isfinite(system.cost)) return INFINITY;
+    for (integer i = 0; i < iterations; i++) {
+        double damped[MOST_COLUMNS * MOST_COLUMNS], step[MOST_COLUMNS];
+        memcpy(damped, system.normal, sizeof damped);
+        for (integer p = 0; p < columns; p++) {
+            damped[p * (columns + 1)] += damping * system.normal[p * (columns + 1)] + 1e-12;
+            step[p] = -system.gradient[p];
+        }
+        if (!solve(columns, damped, step)) return INFINITY;
+        trial_at = at;
+        trial_at.inverse_rate += step[columns - 1];
+        trial_at.intercept += step[columns - 2];
+        if (free_count) retract(&trial_at, calibrated, step);
+        alignment_system(&samples, &trial_at, width, &trial);
+        if (trial.cost < system.cost) {
+            at = trial_at;
+            damping = damping / 5.0 > 1e-9 ? damping / 5.0 : 1e-9;
+            if (width == final_width) {
+                double gain = system.cost - trial.cost, limit = tolerance * system.cost;
+                system = trial;
+                if (gain * gain / (gain > last_gain ? gain : last_gain) < limit) break;
+                last_gain = gain;
+                continue;
+            }
+        } else if (width == final_width) {
+            damping *= 8.0;
+            if (damping > 1e3) break;
+            continue;
+        }
+        width = 0.5 * width > final_width ? 0.5 * width : final_width;
+        alignment_system(&samples, &at, width, &system);
+    }
+    if (!(at.inverse_rate > 0.5 && at.inverse_rate < 2.0) || width > final_width) return INFINITY;
+    memcpy(state, &at, sizeof at);
+    memcpy(normal, system.normal, sizeof(double) * (size_t)(columns * columns));
+    return system.cost;
+}
+
+#define LANES 8
+#define FOR_LANES for (int lane = 0; lane < LANES; lane++)
+typedef double lanes[LANES];
+
+static const int monomial[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+
+/* Taubin's normalisation times a vector of eight: noise_a, noise_b are of the six monomials. */
+static INLINE void normalise(lanes *noise_a, lanes *noise_b, lanes *vector, lanes *out)
+{
+    for (int p = 0; p < 8; p++) FOR_LANES out[p][lane] = 0.0;
+    for (int i = 0; i < 2; i++)
+        for (int j = 0; j < 3; j++)
+            for (int l = 0; l < 3; l++)
+                FOR_LANES out[3 * i + j][lane] += noise_b[monomial[j][l]][lane] * vector[3 * i + l][lane];
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 2; j++)
+            for (int k = 0; k < 3; k++)
+                FOR_LANES out[3 * i + j][lane] += noise_a[monomial[i][k]][lane] * vector[3 * k + j][lane];
+}
+
+static INLINE void ldl_solve(lanes (*factor)[8], lanes *right, lanes *out)
+{
+    memcpy(out, right, sizeof(lanes) * 8);
+    for (int k = 0; k < 8; k++)
+        for (int i = k + 1; i < 8; i++) FOR_LANES out[i][lane] -= factor[i][k][lane] * out[k][lane];
+    for (int k = 0; k < 8; k++) FOR_LANES out[k][lane] /= factor[k][k][lane];
+    for (int k = 7; k >= 0; k--)
+        for (int i = 0; i < k; i++) FOR_LANES out[i][lane] -= factor[k][i][lane] * out[k][lane];
+}
+
+static INLINE void dot(lanes *a, lanes *b, lanes out)
+{
+    FOR_LANES out[lane] = 0.0;
+    for (int p = 0; p < 8; p++) FOR_LANES out[lane] += a[p][lane] * b[p][lane];
+}
+
+static INLINE double at_least(double value, double least) { return value > least ? value : least; }
+
+/* hub.sync.lag_scan.smallest_eigenvalues: moments (6, 6, m); out (m,). */
+WIDE void smallest_eigenvalues(integer m, const double *moments, double variance_a, double variance_b, integer iterations,
+                          double min_orthogonal, double *out)
+{
+    static const double start_phase = 1.7;
+    double first[8];
+    for (int p = 0; p < 8; p++) first[p] = cos(start_phase * (p + 1.0) * (p + 1.0));
+    for (integer begin = 0; begin < m; begin += LANES) {
+        lanes scaled[6][6], work[8][8], noise_a[6], noise_b[6], y[8], z[8], image[8], by_moment[8], image_z[8];
+        integer many = m - begin < LANES ? m - begin : LANES;
+        for (int i = 0; i < 6; i++)
+            for (int j = 0; j < 6; j++)
+                FOR_LANES scaled[i][j][lane] = moments[(6 * i + j) * m + begin + (lane < many ? lane : 0)];
+        lanes total;
+        FOR_LANES total[lane] = at_least(scaled[5][5][lane], 1e-9);
+        for (int i = 0; i < 6; i++)
+            for (int j = 0; j < 6; j++) FOR_LANES scaled[i][j][lane] /= total[lane];
+        for (int i = 0; i < 6; i++) {
+            FOR_LANES noise_a[i][lane] = variance_b * scaled[i][5][lane];
+            FOR_LANES noise_b[i][lane] = variance_a * scaled[5][i][lane];
+        }
+        /* Entry (p, q) of the moment matrix, the constant term eliminated. */
+        for (int p = 0; p < 8; p++) {
+            double *edge = scaled[monomial[p / 3][2]][monomial[p % 3][2]];
+            for (int q = 0; q <= p; q++) {
+                double *other = scaled[monomial[q / 3][2]][monomial[q % 3][2]];
+                double *whole = scaled[monomial[p / 3][q / 3]][monomial[p % 3][q % 3]];
+                FOR_LANES work[p][q][lane] = whole[lane] - other[lane] * (edge[lane] / scaled[5][5][lane]);
+            }
+        }
+        lanes least;
+        FOR_LANES least[lane] = 0.0;
+        for (int p = 0; p < 8; p++) FOR_LANES least[lane] += work[p][p][lane];
+        FOR_LANES least[lane] = 1e-13 * at_least(least[lane], 1e-300);
+        for (int k = 0; k < 8; k++) {
+            lanes column[8];
+            FOR_LANES work[k][k][lane] = at_least(work[k][k][lane], least[lane]);
+            for (int i = k + 1; i < 8; i++) {
+                FOR_LANES column[i][lane] = work[i][k][lane];
+                FOR_LANES work[i][k][lane] /= work[k][k][lane];
+            }
+            for (int i = k + 1; i < 8; i++)
+                for (int j = k + 1; j <= i; j++) FOR_LANES work[i][j][lane] -= work[i][k][lane] * column[j][lane];
+        }
+        for (int p = 0; p < 8; p++) FOR_LANES y[p][lane] = first[p];
+        normalise(noise_a, noise_b, y, image);
+        for (integer step = 0; step < iterations; step++) {
+            lanes length;
+            memcpy(by_moment, image, sizeof image);
+            ldl_solve(work, image, y);
+            normalise(noise_a, noise_b, y, image);
+            dot(y, image, length);
+            FOR_LANES length[lane] = 1.0 / sqrt(at_least(length[lane], 1e-300));
+            for (int p = 0; p < 8; p++)
+                FOR_LANES {
+                    y[p][lane] *= length[lane];
+                    image[p][lane] *= length[lane];
+                    by_moment[p][lane] *= length[lane];
+                }
+        }
+        ldl_solve(work, image, z);
+        normalise(noise_a, noise_b, z, image_z);
+        /* Rayleigh-Ritz step over the span of the last two. */
+        lanes moment_y, moment_z, norm_z, along;
+        dot(y, by_moment, moment_y);
+        dot(z, image, moment_z);
+        dot(z, image_z, norm_z);
+        dot(y, image_z, along);
+        for (int lane = 0; lane < many; lane++) {
+            double length = at_least(norm_z[lane], 1e-300);
+            double value = moment_z[lane] / length, share = along[lane] / length;
+            double rest = at_least(1.0 - along[lane] * share, 0.0);
+            if (rest > min_orthogonal) {
+                double gap = 1.0 - share * moment_z[lane], across = gap * gap / (length * rest);
+                double other = (moment_y[lane] - 2.0 * share + share * share * moment_z[lane]) / rest;
+                double half = 0.5 * (other - value);
+                value -= across / at_least(half + sqrt(half * half + across), 1e-300);
+            }
+            out[begin + lane] = value > 0.0 || isnan(value) ? value : 0.0;
+        }
+    }
+}
+
+/* hub.trajectory.image_tracks._neighbour_score: points (n, 2); rows (kept,): the good ones; scores (n,). */
+void neighbour_scores(integer n, const double *time, const double *points, integer kept, const integer *rows,
+                      integer one_sided, double share_of_lines, double *out)
+{
+    enum { EACH = 4 };
+    integer passed = 0; /* good rows before this one */
+    for (integer i = 0; i < n; i++) {
+        int good = passed < kept && rows[passed] == i, known = 0;
+        integer place[2 * EACH];
+        double lines[EACH * EACH + EACH * (EACH - 1)];
+        for (int k = 0; k < EACH; k++) {
+            place[k] = passed - 1 - k;
+            place[EACH + k] = passed + good + k;
+        }
+        for (int low = 0; low < 2 * EACH; low++)
+            for (int high = 0; high < 2 * EACH; high++) {
+                int two_sided = low < EACH && high >= EACH;
+                int same_side = one_sided && (low < EACH ? high < low : high > low);
+                if ((!two_sided && !same_side) || place[low] < 0 || place[high] < 0) continue;
+                if (place[low] >= kept || place[high] >= kept) continue;
+                integer p = rows[place[low]], q = rows[place[high]];
+                double share = (time[i] - time[p]) / (time[q] - time[p]);
+                double across = points[2 * i] - points[2 * p] - share * (points[2 * q] - points[2 * p]);
+                double down = points[2 * i + 1] - points[2 * p + 1] - share * (points[2 * q + 1] - points[2 * p + 1]);
+                double distance = sqrt(across * across + down * down);
+                if (isfinite(distance)) lines[known++] = distance;
+            }
+        int pick = (int)ceil(share_of_lines * known) - 1;
+        /* The smallest few in order, by selection. */
+        for (int k = 0; k <= pick && k < known; k++)
+            for (int j = k + 1; j < known; j++)
+                if (lines[j] < lines[k]) {
+                    double other = lines[k];
+                    lines[k] = lines[j];
+                    lines[j] = other;
+                }
+        out[i] = known ? lines[pick > 0 ? pick : 0] : 0.0;
+        passed += good;
+    }
+}
+
+/* Median of values (n,), which are reordered. */
+static double median(integer n, double *values)
+{
+    integer middle = n / 2, low = 0, high = n - 1;
+    while (low < high) { /* quickselect */
+        double pivot = values[(low + high) / 2];
+        integer i = low, j = high;
+        while (i <= j) {
+            while (values[i] < pivot) i++;
+            while (values[j] > pivot) j--;
+            if (i <= j) {
+                double other = values[i];
+                values[i++] = values[j];
+                values[j--] = other;
+            }
+        }
+        if (middle <= j) high = j;
+        else if (middle >= i) low = i;
+        else break;
+    }
+    if (n % 2) return values[middle];
+    double below = values[0];
+    for (integer i = 1; i < middle; i++)
+        if (values[i] > below) below = values[i];
+    return 0.5 * (below + values[middle]);
+}
+
+/* The symmetric matrix (9, 9) to diagonal form by Jacobi's rotations, which are applied to the columns of basis too. */
+static void diagonalise(double matrix[9][9], double basis[9][9])
+{
+    double total = 0.0;
+    for (int p = 0; p < 9; p++) total += fabs(matrix[p][p]);
+    for (int sweep = 0; sweep < 30; sweep++) {
+        double off = 0.0;
+        for (int p = 0; p < 9; p++)
+            for (int q = p + 1; q < 9; q++) off += fabs(matrix[p][q]);
+        if (off <= 1e-18 * total) return;
+        for (int p = 0; p < 9; p++)
+            for (int q = p + 1; q < 9; q++) {
+                if (fabs(matrix[p][q]) <= 1e-20 * total) continue;
+                double theta = 0.5 * (matrix[q][q] - matrix[p][p]) / matrix[p][q];
+                double t = (theta < 0.0 ? -1.0 : 1.0) / (fabs(theta) + sqrt(theta * theta + 1.0));
+                double c = 1.0 / sqrt(t * t + 1.0), s = t * c;
+                for (int k = 0; k < 9; k++) {
+                    double x = matrix[k][p], y = matrix[k][q];
+                    matrix[k][p] = c * x - s * y;
+                    matrix[k][q] = s * x + c * y;
+                }
+                for (int k = 0; k < 9; k++) {
+                    double x = matrix[p][k], y = matrix[q][k], v = basis[k][p], w = basis[k][q];
+                    matrix[p][k] = c * x - s * y;
+                    matrix[q][k] = s * x + c * y;
+                    basis[k][p] = c * v - s * w;
+                    basis[k][q] = s * v + c * w;
+                }
+            }
+    }
+}
+
+/* hub.two_view.fundamental.hartley_normalisation of points (2, n) to out; returns the spread. */
+static double hartley(integer n, const double *points, double *out)
+{
+    double x = 0.0, y = 0.0, spread = 0.0;
+    for (integer i = 0; i < n; i++) {
+        x += points[i];
+        y += points[n + i];
+    }
+    x /= (double)n;
+    y /= (double)n;
+    for (integer i = 0; i < n; i++) {
+        out[i] = points[i] - x;
+        out[n + i] = points[n + i] - y;
+        spread += out[i] * out[i] + out[n + i] * out[n + i];
+    }
+    spread = at_least(sqrt(spread / (2.0 * (double)n)), 1e-12);
+    for (integer i = 0; i < 2 * n; i++) out[i] /= spread;
+    return spread;
+}
+
+/* hub.two_view.relative_pose.homography_residual of points (2, n) of a and b, before the division by the median of a
+   Rayleigh variable. scratch: (6 n,). */
+WIDE double homography_residual(integer n, const double *points_a, const double *points_b, integer iterations,
+                           double *scratch)
+{
+    static const int index[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+    double *a = scratch, *b = scratch + 2 * n, *weight = scratch + 4 * n, *distance = scratch + 5 * n;
+    double basis[9][9] = {{0.0}}, h[9] = {0.0}, spread_a = hartley(n, points_a, a), spread_b = hartley(n, points_b, b);
+    double scale = spread_b / spread_a; /* of units of b over units of a */
+    for (int p = 0; p < 9; p++) basis[p][p] = 1.0;
+    for (integer i = 0; i < n; i++) weight[i] = 1.0;
+    for (integer step = 0; step < iterations; step++) {
+        double sums[4][6] = {{0.0}}, normal[9][9] = {{0.0}}, turned[9][9], work[9][9];
+        for (integer i = 0; i < n; i++) {
+            double px = a[i], py = a[n + i], x = b[i], y = b[n + i], w = weight[i] * weight[i];
+            double outer[6] = {px * px, px * py, px, py * py, py, 1.0}, of_b[4] = {w, -x * w, -y * w, (x * x + y * y) * w};
+            for (int k = 0; k < 4; k++)
+                for (int j = 0; j < 6; j++) sums[k][j] += of_b[k] * outer[j];
+        }
+        for (int p = 0; p < 3; p++)
+            for (int q = 0; q < 3; q++) {
+                int j = index[p][q];
+                normal[p][q] = normal[3 + p][3 + q] = sums[0][j];
+                normal[p][6 + q] = normal[6 + q][p] = sums[1][j];
+                normal[3 + p][6 + q] = normal[6 + q][3 + p] = sums[2][j];
+                normal[6 + p][6 + q] = sums[3][j];
+            }
+        /* From the eigenvectors of the step before few rotations are left. */
+        for (int p = 0; p < 9; p++)
+            for (int q = 0; q < 9; q++) {
+                turned[p][q] = 0.0;
+                for (int k = 0; k < 9; k++) turned[p][q] += normal[p][k] * basis[k][q];
+            }
+        for (int p = 0; p < 9; p++)
+            for (int q = 0; q < 9; q++) {
+                work[p][q] = 0.0;
+                for (int k = 0; k < 9; k++) work[p][q] += basis[k][p] * turned[k][q];
+            }
+        diagonalise(work, basis);
+        int least = 0;
+        for (int p = 1; p < 9; p++)
+            if (work[p][p] < work[least][least]) least = p;
+        for (int p = 0; p < 9; p++) h[p] = basis[p][least];
+        for (integer i = 0; i < n; i++) {
+            double depth = h[6] * a[i] + h[7] * a[n + i] + h[8];
+            depth = fabs(depth) > 1e-12 ? depth : 1e-12;
+            double u = (h[0] * a[i] + h[1] * a[n + i] + h[2]) / depth, v = (h[3] * a[i] + h[4] * a[n + i] + h[5]) / depth;
+            weight[i] = sqrt((u - b[i]) * (u - b[i]) + (v - b[n + i]) * (v - b[n + i]));
+        }
+        memcpy(distance, weight, sizeof(double) * (size_t)n);
+        double width = at_least(3.0 * median(n, distance), 1e-12), largest = 0.0;
+        for (integer i = 0; i < n; i++) {
+            double depth = h[6] * a[i] + h[7] * a[n + i] + h[8], ratio = weight[i] / width;
+            depth = fabs(depth) > 1e-12 ? depth : 1e-12;
+            weight[i] = 1.0 / fabs(depth) / (1.0 + ratio * ratio);
+            largest = at_least(weight[i], largest);
+        }
+        for (integer i = 0; i < n; i++) weight[i] /= largest;
+    }
+    for (integer i = 0; i < n; i++) {
+        double depth = h[6] * a[i] + h[7] * a[n + i] + h[8];
+        depth = fabs(depth) > 1e-12 ? depth : 1e-12;
+        double u = (h[0] * a[i] + h[1] * a[n + i] + h[2]) / depth, v = (h[3] * a[i] + h[4] * a[n + i] + h[5]) / depth;
+        double over = scale / depth, ex = u - b[i], ey = v - b[n + i];
+        double s00 = (h[0] - u * h[6]) * over, s01 = (h[1] - u * h[7]) * over;
+        double s10 = (h[3] - v * h[6]) * over, s11 = (h[4] - v * h[7]) * over, area = s00 * s11 - s01 * s10;
+        double along0 = s00 * ey - s10 * ex, along1 = s01 * ey - s11 * ex;
+        double determinant = 1.0 + s00 * s00 + s01 * s01 + s10 * s10 + s11 * s11 + area * area;
+        distance[i] = sqrt(2.0 * (ex * ex + ey * ey + along0 * along0 + along1 * along1) / determinant);
+    }
+    return median(n, distance) * spread_b;
+}

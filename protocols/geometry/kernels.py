@@ -1,0 +1,201 @@
+"""Compiled inner loops (kernels.c), where the installation had a C compiler; numpy does the same elsewhere.
+
+For arrays of a few hundred rows numpy's time is that of its calls. Callers ask ``AVAILABLE`` and have the numpy code
+beside it, which is also what the tests compare with. ``SYNCLINE_PURE=1`` leaves them out, of wheels too.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from ctypes import CDLL, addressof, c_char, c_double, c_int64, c_void_p
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from protocols.geometry.types import Bools, Floats, Ints
+
+_KINDS = {"n": c_int64, "d": c_double, "p": c_void_p}
+_SIGNATURES = {
+    "spline_weights": "npnpdpppp",
+    "spline_values": "npnpnnppp",
+    "weighted_sums": "nnpppp",
+    "spline_normal": "npppnpnpdnpp",
+    "add_rows": "nppnpppp",
+    "brown_distortion": "npppp",
+    "refine_alignment": "nppppnndddnddndp",
+    "smallest_eigenvalues": "npddndp",
+    "neighbour_scores": "nppnpndp",
+    "homography_residual": "nppnp",
+}
+"""Of each function: counts n, doubles d and pointers p."""
+
+
+def load(file: Path) -> CDLL | None:
+    """The library in a file; None if there is none for this machine."""
+    try:
+        library = CDLL(str(file))
+        for name, kinds in _SIGNATURES.items():
+            function = getattr(library, name)
+            function.argtypes, function.restype = [_KINDS[kind] for kind in kinds], None
+        library.homography_residual.restype = library.refine_alignment.restype = c_double
+    except (OSError, AttributeError):
+        return None
+    return library
+
+
+_found = None if os.environ.get("SYNCLINE_PURE") else load(Path(__file__).with_name("libkernels.so"))
+AVAILABLE, _library = _found is not None, cast(CDLL, _found)
+
+
+def _at(array: Floats | Ints | Bools) -> int:
+    """The address of an array, which is contiguous and outlives the call."""
+    try:
+        return addressof(c_char.from_buffer(array))  # type: ignore[arg-type]  # a third of the time of numpy's own
+    except (TypeError, ValueError):  # read-only or empty
+        return array.ctypes.data
+
+
+def _rows_last(points: Floats) -> Floats:
+    """(d, n) contiguous, of (n, d)."""
+    return np.ascontiguousarray(points.T, dtype=np.float64)
+
+
+def spline_weights(
+    basis: Floats, time: Floats, extrapolation: float, slopes: bool
+) -> tuple[Ints, Floats, Floats, Bools]:
+    """First control points (n,), weights (4, n), those of the slopes (4, n) or (4, 0), inside (n,).
+
+    basis: (4, stretches) starts, widths, numbers of intervals, first control points. time: (n,).
+    """
+    time, count = np.ascontiguousarray(time, dtype=np.float64), len(time)
+    index, inside = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.bool_)
+    weights, derivatives = np.empty((4, count)), np.empty((4, count if slopes else 0))
+    to = _at(derivatives) if slopes else 0
+    _library.spline_weights(
+        count, _at(time), basis.shape[1], _at(basis), extrapolation, _at(index), _at(weights), to, _at(inside)
+    )
+    return index, weights, derivatives, inside
+
+
+def spline_values(basis: Floats, time: Floats, polynomials: Floats) -> tuple[Floats, Floats]:
+    """Values and slopes (d, n) at time (n,); NaN outside. polynomials: (4, d, m)."""
+    time, (_, width, size) = np.ascontiguousarray(time, dtype=np.float64), polynomials.shape
+    values, slopes = np.empty((2, width, len(time)))
+    _library.spline_values(
+        len(time), _at(time), basis.shape[1], _at(basis), width, size, _at(polynomials), _at(values), _at(slopes)
+    )
+    return values, slopes
+
+
+def weighted_sums(control: Floats, index: Ints, weights: Floats) -> Floats:
+    """(d, n) sums of four control points from ``index`` (n,) on. control: (size, d). weights: (4, n)."""
+    control, weights = np.ascontiguousarray(control, dtype=np.float64), np.ascontiguousarray(weights)
+    index = np.ascontiguousarray(index, dtype=np.int64)
+    out = np.empty((control.shape[1], len(index)))
+    _library.weighted_sums(len(index), control.shape[1], _at(control), _at(index), _at(weights), _at(out))
+    return out
+
+
+def spline_normal(
+    rows: tuple[Ints, Floats], row_weight: Floats, values: Floats, basis: Floats, stiffness: float, size: int
+) -> tuple[Floats, Floats]:
+    """Bands (4, size) of the normal matrix and right-hand side (d, size) of a fit to values (n, d).
+
+    rows: first control points (n,) and weights (4, n).
+    """
+    index, row_weight = np.ascontiguousarray(rows[0], dtype=np.int64), np.ascontiguousarray(row_weight)
+    weights, values = np.ascontiguousarray(rows[1]), np.ascontiguousarray(values, dtype=np.float64)
+    width = values.shape[1]
+    bands, target = np.zeros((4, size)), np.zeros((width, size))
+    given = _at(index), _at(weights), _at(row_weight), width, _at(values), basis.shape[1], _at(basis)
+    _library.spline_normal(len(index), *given, stiffness, size, _at(bands), _at(target))
+    return bands, target
+
+
+MOST_TERMS = 21
+"""Columns beside the point's that `add_rows` takes: the parameters of a camera and the residual."""
+
+
+def add_rows(index: Ints, weights: Floats, terms: Floats, sums: Floats, crossed: Floats, gram: Floats) -> None:
+    """Add rows to the sums of `hub.bundle.bordered_system.PathBlocks`. weights: (4, n). terms: (2, 3 + p, n)."""
+    index, weights = np.ascontiguousarray(index, dtype=np.int64), np.ascontiguousarray(weights)
+    terms, width = np.ascontiguousarray(terms), terms.shape[1] - 3
+    to = _at(sums), _at(crossed), _at(gram)
+    _library.add_rows(len(index), _at(index), _at(weights), width, _at(terms), *to)
+
+
+def brown_distortion(normalised: Floats, coefficients: Floats) -> tuple[Floats, Floats]:
+    """Distorted coordinates (2, n) of normalised ones (n, 2), and their Jacobian (2, 2, n)."""
+    normalised, coefficients = _rows_last(normalised), np.ascontiguousarray(coefficients, dtype=np.float64)
+    out, jacobian = np.empty(normalised.shape), np.empty((2, *normalised.shape))
+    _library.brown_distortion(normalised.shape[1], _at(normalised), _at(coefficients), _at(out), _at(jacobian))
+    return out, jacobian
+
+
+class SampledTracks:
+    """Points of one camera's tracks at their own times, and the splines of another camera's, for `refine_alignment`.
+
+    points: (n, 2), label by label. centred_time: (n,). rows: number of each label's rows. splines: of each label, the
+    basis (4, stretches) and the polynomials (4, 2, m).
+    """
+
+    def __init__(
+        self, points: Floats, centred_time: Floats, rows: Sequence[int], splines: Sequence[tuple[Floats, Floats]]
+    ) -> None:
+        self.count = len(points)
+        bases, polynomials = zip(*splines, strict=True)
+        self._kept: list[Floats | Ints] = [_rows_last(points), np.ascontiguousarray(centred_time), *bases, *polynomials]
+        sizes = [[basis.shape[1] for basis in bases], [one.shape[2] for one in polynomials]]
+        tables = [np.cumsum(rows, dtype=np.int64), *np.array(sizes, dtype=np.int64)]
+        tables += [np.array([_at(one) for one in part], dtype=np.int64) for part in (bases, polynomials)]
+        tracks = np.array([len(bases), *(_at(table) for table in tables)], dtype=np.int64)
+        self._kept += [*tables, tracks]
+        self.at = _at(self._kept[0]), _at(self._kept[1]), _at(tracks)
+
+
+def refine_alignment(
+    samples: SampledTracks,
+    state: Floats,
+    kind: tuple[bool, int],
+    noise: tuple[float, float, float],
+    widths: tuple[float, float],
+    limits: tuple[int, int, float],
+) -> tuple[float, Floats]:
+    """Cost, infinite where there is none, and normal matrix of `hub.two_view.refinement.refine`.
+
+    state: (23,) of a pose rotation, nine unused, direction; or left, right, angle, two unused; then inverse rate and
+    intercept; in place. kind: whether a pose, and free parameters of the geometry. noise: sigma of a and of b, prior of
+    the rate. widths: first and last of the Cauchy weight. limits: least rows, most iterations, tolerance.
+    """
+    normal, (least, iterations, tolerance) = np.empty((kind[1] + 2,) * 2), limits
+    given = *kind, noise[0] ** 2, noise[1] ** 2, noise[2] ** -2, least, *widths, iterations, tolerance
+    cost: float = _library.refine_alignment(samples.count, *samples.at, _at(state), *given, _at(normal))
+    return cost, normal
+
+
+def smallest_eigenvalues(
+    moments: Floats, sigma_a: float, sigma_b: float, iterations: int, min_orthogonal: float
+) -> Floats:
+    """Smallest generalised eigenvalues (m,) of moments (6, 6, m) under Taubin's normalisation."""
+    moments, count = np.ascontiguousarray(moments), moments.shape[2]
+    out = np.empty(count)
+    _library.smallest_eigenvalues(count, _at(moments), sigma_a**2, sigma_b**2, iterations, min_orthogonal, _at(out))
+    return out
+
+
+def neighbour_scores(time: Floats, points: Floats, rows: Ints, one_sided: bool, share: float) -> Floats:
+    """Quantile ``share`` (n,) of each point's distances from lines through two of the good ones ``rows``."""
+    time, points = np.ascontiguousarray(time), np.ascontiguousarray(points)
+    out = np.empty(len(time))
+    _library.neighbour_scores(len(time), _at(time), _at(points), len(rows), _at(rows), int(one_sided), share, _at(out))
+    return out
+
+
+def homography_residual(a: Floats, b: Floats, iterations: int) -> float:
+    """Median distance of points b (n, 2) from a mapped by the best homography, in b's unit."""
+    count, scratch = len(a), np.empty(6 * len(a))
+    a, b = _rows_last(a), _rows_last(b)
+    found: float = _library.homography_residual(count, _at(a), _at(b), iterations, _at(scratch))
+    return found

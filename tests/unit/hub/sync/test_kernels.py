@@ -1,0 +1,155 @@
+"""The compiled kernels do what numpy does without them; they are compiled for this test where there is a compiler."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hatch_build import FLAGS
+from hub.bundle.bordered_system import PathBlocks
+from hub.sync.lag_scan import smallest_eigenvalues
+from hub.sync.pair_solver import solve_pair
+from hub.trajectory.image_tracks import neighbour_test, smooth_track
+from hub.trajectory.splines import SplineBasis, fit_spline, weighted_sums
+from hub.two_view.relative_pose import homography_residual
+from protocols.geometry import kernels
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Floats
+from tests.bench.pair_trials import FOCAL, MATRIX, Regime, make_trial
+
+_SOURCE = Path(kernels.__file__).with_name("kernels.c")
+Both = Callable[[Callable[[], Floats]], tuple[Floats, Floats]]
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler here: numpy is what runs")
+    out = tmp_path_factory.mktemp("kernels") / "libkernels.so"
+    subprocess.run([compiler, *FLAGS, "-Wall", "-Wextra", "-Werror", "-o", out, _SOURCE, "-lm"], check=True)
+    return out
+
+
+@pytest.fixture
+def both(library: Path, monkeypatch: pytest.MonkeyPatch) -> Both:
+    """What a function gives by the kernels, and by numpy."""
+    monkeypatch.setattr(kernels, "_library", kernels.load(library))
+
+    def run(function: Callable[[], Floats]) -> tuple[Floats, Floats]:
+        found = []
+        for available in (True, False):
+            monkeypatch.setattr(kernels, "AVAILABLE", available)
+            found.append(np.asarray(function()))
+        return found[0], found[1]
+
+    return run
+
+
+@pytest.fixture
+def basis() -> SplineBasis:
+    return SplineBasis.spanning(np.array([0.0, 3.0, 5.5]), np.array([2.0, 5.5, 9.0]), 0.3)
+
+
+def times(rng: np.random.Generator) -> Floats:
+    """In no order, some outside the stretches or unknown."""
+    return np.concatenate([rng.uniform(-1.0, 10.0, 300), [np.nan, 0.0, 2.0, 5.5, 9.0, np.inf]])
+
+
+@pytest.mark.parametrize("extrapolation", [0.0, 0.5])
+def test_splines_are_evaluated_alike(both: Both, basis: SplineBasis, extrapolation: float) -> None:
+    rng = np.random.default_rng(1)
+    time, control = times(rng), rng.normal(size=(basis.size, 2))
+    inside = basis.weights_and_derivatives(time, extrapolation)[3]
+    assert 0 < inside.sum() < len(time)
+    for function in (
+        lambda: basis.weights_and_derivatives(time, extrapolation)[3],
+        lambda: basis.weights_and_derivatives(time, extrapolation)[0][inside],
+        lambda: basis.weights_and_derivatives(time, extrapolation)[1][inside],
+        lambda: basis.weights_and_derivatives(time, extrapolation)[2][inside],
+        lambda: basis.evaluate(control, time, 1),
+        lambda: weighted_sums(control, *basis.weights(time)[:2])[inside],
+        lambda: np.stack(basis.evaluate_with_derivatives(basis.polynomials(control), time)),
+    ):
+        np.testing.assert_allclose(*both(function), rtol=1e-12, atol=1e-12)
+
+
+def test_splines_are_fitted_alike(both: Both, basis: SplineBasis) -> None:
+    rng = np.random.default_rng(2)
+    time = times(rng)
+    values, weight = rng.normal(size=(len(time), 3)), rng.uniform(0.0, 1.0, len(time)).round(1)
+    np.testing.assert_allclose(*both(lambda: fit_spline(basis, basis.weights(time), values, weight, 1e-2)), rtol=1e-9)
+
+
+def test_eigenvalues_are_those_of_numpy(both: Both) -> None:
+    rng = np.random.default_rng(3)
+    x, y = rng.normal(size=(2, 37, 2, 60))
+    monomials = np.stack([x * x, x * y, x, y * y, y, np.ones_like(x)])  # of both cameras at 60 times of 37 lags
+    moments = np.einsum("imt,jmt->ijm", monomials[:, :, 0], monomials[:, :, 1])
+    np.testing.assert_allclose(*both(lambda: smallest_eigenvalues(moments, 0.02, 0.03)), rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [8, 9, 301])
+def test_planes_leave_the_same_residual(both: Both, count: int) -> None:
+    rng = np.random.default_rng(count)
+    a = rng.normal(0.0, 100.0, (count, 2))
+    b = a @ np.array([[0.9, 0.2], [-0.1, 1.1]]) + rng.normal(0.0, 2.0, (count, 2)) + 50.0
+    np.testing.assert_allclose(*both(lambda: np.asarray(homography_residual(a, b))), rtol=1e-6)
+
+
+def test_neighbours_are_judged_alike(both: Both) -> None:
+    rng = np.random.default_rng(5)
+    time = np.sort(rng.uniform(0.0, 4.0, 120))
+    points = np.stack([np.sin(time), np.cos(time)], axis=1)
+    points[rng.random(120) < 0.2] += 1.0
+    by_kernels, by_numpy = both(lambda: neighbour_test(time, points, 1e-3))
+    assert 0 < by_numpy.sum() < 120
+    np.testing.assert_array_equal(by_kernels, by_numpy)
+
+
+@pytest.mark.parametrize("others", [1, 12, 22])
+def test_rows_of_the_adjustment_add_up_alike(both: Both, others: int) -> None:
+    rng = np.random.default_rng(6)
+    index, weights, terms = rng.integers(0, 20, 90), rng.random((90, 4)), rng.normal(size=(2, 3 + others, 90))
+
+    def sums() -> Floats:
+        blocks = PathBlocks(24)
+        crossed, gram = blocks.add_rows(index, weights, terms)
+        return np.concatenate([blocks.band().ravel(), crossed.ravel(), gram.ravel()])
+
+    np.testing.assert_allclose(*both(sums), rtol=1e-10, atol=1e-10)
+
+
+def test_lenses_bend_alike(both: Both) -> None:
+    lens = Intrinsics(800, 600, MATRIX, np.array([-0.2, 0.05, 1e-3, -2e-3, 0.01]))
+    normalised = np.random.default_rng(7).uniform(-0.5, 0.5, (50, 2))
+    for part in (0, 1):
+        np.testing.assert_allclose(*both(lambda part=part: lens.distort(normalised)[part]), rtol=1e-13, atol=1e-13)  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_a_pair_has_the_same_solution(both: Both, calibrated: bool) -> None:
+    trial = make_trial(Regime(dropped=0.2, outliers=0.05, gaps=2), 41)
+
+    def solution() -> Floats:
+        tracks = [smooth_track(one.time, (one.pixels - MATRIX[:2, 2]) / FOCAL, FOCAL) for one in trial.views]
+        a, b = tracks
+        assert a is not None
+        assert b is not None
+        fit = solve_pair({"x": a, "y": a}, {"x": b, "y": b}, ("a", "b"), calibrated=calibrated).fit
+        assert fit is not None
+        return np.array([fit.offset, fit.rate, fit.residual_px, fit.lag_std, *fit.geometry.matrix.ravel()])
+
+    np.testing.assert_allclose(*both(solution), rtol=1e-6)
+
+
+def test_without_a_library_there_is_none(tmp_path: Path) -> None:
+    assert kernels.load(tmp_path / "libkernels.so") is None
+    foreign = tmp_path / "foreign.so"
+    foreign.write_bytes(b"no library")
+    assert kernels.load(foreign) is None
