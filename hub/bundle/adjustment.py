@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from hub.bundle.bordered_system import solve
 from hub.bundle.normal_equations import assemble, weigh_residuals
@@ -35,7 +36,6 @@ from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.compiled import chdtri
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.calibration import AdjustmentStep

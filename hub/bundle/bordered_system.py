@@ -9,16 +9,24 @@ length of the recording (Schur complement C - Bᵀ A⁻¹ B).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csc_array
 
 from hub.trajectory.banded import cho_solve_banded, cholesky_banded, solve_upper_transposed
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT, SplineBasis
 from protocols.geometry import kernels
-from protocols.geometry.compiled import csc_matvecs
 from protocols.geometry.types import Floats, Ints
+
+try:  # what a product of scipy's sparse matrices ends in; here without its checks, and added in place
+    from scipy.sparse import _sparsetools
+
+    _csc_matvecs: Callable[..., None] | None = _sparsetools.csc_matvecs
+except (ImportError, AttributeError):
+    _csc_matvecs = None
 
 _ROWS_AT_ONCE = 1001  # products of so many fit a core's cache; no power of two, whose columns displace each other there
 
@@ -105,14 +113,14 @@ def border_block(index: Ints, weights: Floats, values: Floats, size: int) -> Flo
 
 
 def add_row_sums(out: Floats, weights: Floats, columns: Ints, values: Floats) -> None:
-    """Add to out (size, p) the sums over rows of weights (n, k) at columns (n, k) times values (n, p).
-
-    By what a product of scipy's sparse matrices ends in, without its checks, and added in place.
-    """
+    """Add to out (size, p) the sums over rows of weights (n, k) at columns (n, k) times values (n, p)."""
     rows, each = weights.shape
     starts, places = np.arange(0, each * rows + 1, each, dtype=np.int32), columns.astype(np.int32).ravel()
-    flat = np.ascontiguousarray(values).ravel()
-    csc_matvecs(len(out), rows, values.shape[1], starts, places, weights.ravel(), flat, out.reshape(-1))
+    if _csc_matvecs is None:
+        out += np.asarray(csc_array((weights.ravel(), places, starts), shape=(len(out), rows)) @ values)
+    else:
+        flat = np.ascontiguousarray(values).ravel()
+        _csc_matvecs(len(out), rows, values.shape[1], starts, places, weights.ravel(), flat, out.reshape(-1))
 
 
 def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats, metric: Floats) -> Floats:

@@ -6,6 +6,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import erf
 
 from hub.bundle.bordered_system import BAND, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
@@ -13,7 +14,6 @@ from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState,
 from hub.bundle.smoothness_prior import SmoothnessPrior
 from hub.trajectory.splines import SUPPORT, weighted_sums
 from protocols.geometry import so3
-from protocols.geometry.compiled import erf
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 

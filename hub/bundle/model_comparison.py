@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from hub.bundle.adjustment import apply_step, estimate_noise, gauge_tangent
 from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, cho_solve_path, eliminate
@@ -36,7 +37,6 @@ from hub.bundle.problem import (
 from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.banded import cho_solve_banded
-from protocols.geometry.compiled import chdtri
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.rig import MAX_READOUT_S
 

@@ -14,12 +14,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import fdtri
 
 from hub.bundle.adjustment import adjust
 from hub.bundle.problem import OFFSET, AdjustmentState, Problem
 from hub.bundle.residuals import linearise
 from hub.trajectory.discrete import PointBasis
-from protocols.geometry.compiled import fdtri
 from protocols.geometry.types import Bools, Floats, Ints
 
 _MIN_FRAMES = 25  # from which a variance ratio is known to a third

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri, gammainc, gammaln
 
 from hub.sync.lag_scan import (
     MONOMIAL_INDEX,
@@ -24,7 +25,6 @@ from hub.sync.lag_scan import (
     to_grid_coordinates,
 )
 from hub.trajectory.image_tracks import SmoothTrack
-from protocols.geometry.compiled import chdtri, gammainc, gammaln
 from protocols.geometry.order_statistics import median, quantile
 from protocols.geometry.types import Floats, Ints
 

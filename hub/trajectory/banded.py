@@ -6,8 +6,8 @@ By LAPACK's routines, without the checks of scipy's wrappers, which take as long
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.lapack import dpbsv, dpbtrf, dpbtrs, dptsv, dtbtrs
 
-from protocols.geometry.compiled import dpbsv, dpbtrf, dpbtrs, dptsv, dtbtrs
 from protocols.geometry.types import Floats
 
 

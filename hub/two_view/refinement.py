@@ -14,10 +14,10 @@ from functools import partial
 from typing import TypeAlias
 
 import numpy as np
+from scipy.linalg.lapack import dgesv
 
 from hub.two_view.relative_pose import FundamentalMatrix, RelativePose, TwoViewGeometry
 from protocols.geometry import kernels
-from protocols.geometry.compiled import dgesv
 from protocols.geometry.types import Floats
 
 SEARCH_WIDTH = 2.0

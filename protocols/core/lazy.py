@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
-from importlib.util import find_spec, module_from_spec
-from types import ModuleType
+from importlib.util import LazyLoader, find_spec, module_from_spec
 
 TYPE_CHECKING = False  # as typing's, whose import alone would take most of a package's import time
 if TYPE_CHECKING:
@@ -24,22 +23,11 @@ def lazy_names(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str]
     return get, lambda: sorted(modules)
 
 
-class _Deferred(ModuleType):
-    """A module that is executed when something of it is used; of a package, submodules can be imported before."""
-
-    def __getattr__(self, name: str) -> Any:  # of what it does not have yet
-        spec = self.__spec__
-        object.__setattr__(self, "__class__", ModuleType)
-        if spec is not None and spec.loader is not None:
-            spec.loader.exec_module(self)
-        return getattr(self, name)
-
-
 def defer_modules(package: str, names: Sequence[str]) -> None:
     """Submodules of a package are loaded when something of theirs is used, not when somebody imports them.
 
     names: those that are loaded already are left alone. scipy imports everything that numpy has, f2py, its tests and
-    masked arrays too; and its own packages hold compiled modules that need none of what the package imports.
+    masked arrays too, which takes a third of scipy's own import time.
     """
     parent = import_module(package)
     for name in names:
@@ -47,7 +35,8 @@ def defer_modules(package: str, names: Sequence[str]) -> None:
         spec = None if full in sys.modules else find_spec(full)
         if spec is None or spec.loader is None:
             continue
+        spec.loader = LazyLoader(spec.loader)
         module = module_from_spec(spec)
-        module.__class__ = _Deferred
         sys.modules[full] = module
+        spec.loader.exec_module(module)
         setattr(parent, name, module)

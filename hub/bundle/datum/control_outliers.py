@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+from scipy.special import chdtri, fdtri
 
 from hub.bundle.datum.gauge import (
     CONTRADICTION_SIGMA,
@@ -16,7 +17,6 @@ from hub.bundle.datum.gauge import (
 )
 from hub.bundle.problem import CAMERA_PARAMETERS
 from protocols.geometry import so3
-from protocols.geometry.compiled import chdtri, fdtri
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import solveh_banded
+from scipy.special import chdtri
 
 from hub.bundle.problem import OFFSET
 from hub.bundle.residuals import jacobians
 from hub.calibration.rigid_body.linear_system import assemble, linearised_rows, third_differences
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, pitch
 from hub.trajectory.splines import SplineBasis
-from protocols.geometry.compiled import chdtri
 from protocols.geometry.types import Bools, Floats
 
 _OUTLIER = 5.0  # sigma of the 2-D residual

@@ -1,15 +1,11 @@
-"""Banded solutions, and scipy's compiled routines where scipy keeps them elsewhere."""
+"""Solutions with symmetric banded matrices."""
 
 from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from hub.trajectory import banded
-from protocols.geometry import compiled
 from protocols.geometry.types import Floats
 
 _SIZE, _BANDS = 40, 4  # of a matrix like that of a spline
@@ -60,18 +56,3 @@ def test_an_indefinite_matrix_is_an_error_and_an_empty_one_none(band: Floats) ->
             solve()
     factor = banded.cholesky_banded(np.zeros((_BANDS, 0)))
     assert banded.cho_solve_banded(factor, np.zeros((0, 2))).shape == (0, 2)
-
-
-def test_another_version_of_scipy_gives_the_same() -> None:
-    source = Path(compiled.__file__).read_text(encoding="utf-8").replace("_sparsetools import", "_elsewhere import")
-    other: dict[str, Any] = {"__name__": "other"}
-    exec(compile(source, compiled.__file__, "exec"), other)
-    assert other["csc_matvecs"] is not compiled.csc_matvecs
-    for name in compiled.__all__:
-        assert name in other
-    # Two rows of three, two vectors.
-    starts, places, weights = np.array([0, 2, 3]), np.array([0, 2, 1]), np.array([1.0, 2.0, 3.0])
-    right, found, expected = np.arange(4.0), np.ones(6), np.ones(6)
-    other["csc_matvecs"](3, 2, 2, starts, places, weights, right, found)
-    compiled.csc_matvecs(3, 2, 2, starts, places, weights, right, expected)
-    np.testing.assert_array_equal(found, expected)
