@@ -195,23 +195,25 @@ def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentStat
     That is where their lag is used; away from it the uncertain rates increase the std. For cameras without a common
     span: in the middle of the gap. Diagonal 0.
     """
-    count = len(state.cameras)
+    count, spans = len(state.cameras), _observed_spans(problem, state)
     out = np.zeros((count, count))
     for i, j in itertools.combinations(range(count), 2):
-        middle = float(middle_of_overlap(problem, state, i, j)[0])
-        row = np.zeros(len(cov.cameras))
-        for camera, sign in ((i, 1.0), (j, -1.0)):
-            now = state.cameras[camera]
-            row[camera * CAMERA_PARAMETERS + OFFSET] = sign
-            row[camera * CAMERA_PARAMETERS + RATE] = sign * (middle - now.offset) / now.rate
-        out[i, j] = out[j, i] = np.sqrt(max(float(row @ cov.cameras @ row), 0.0))
+        middle = _middle(spans[[i, j]])
+        of_rates = [(middle - now.offset) / now.rate for now in (state.cameras[i], state.cameras[j])]
+        row = np.array([1.0, of_rates[0], -1.0, -of_rates[1]])
+        columns = [camera * CAMERA_PARAMETERS + parameter for camera in (i, j) for parameter in (OFFSET, RATE)]
+        out[i, j] = out[j, i] = np.sqrt(max(float(row @ cov.cameras[np.ix_(columns, columns)] @ row), 0.0))
     return out
 
 
 def middle_of_overlap(problem: Problem, state: AdjustmentState, first: int, second: int) -> Floats:
     """Internal reference time (1,) in the middle of the common span of two cameras, or of the gap between them."""
-    spans = _observed_spans(problem, state)
-    return np.array([0.5 * (spans[[first, second], 0].max() + spans[[first, second], 1].min())])
+    return np.array([_middle(_observed_spans(problem, state)[[first, second]])])
+
+
+def _middle(spans: Floats) -> float:
+    """Of what spans (2, 2) have in common, or of the gap between them."""
+    return float(0.5 * (spans[:, 0].max() + spans[:, 1].min()))
 
 
 def _observed_spans(problem: Problem, state: AdjustmentState) -> Floats:

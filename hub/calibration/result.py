@@ -104,6 +104,13 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         float(camera.camera_time(cov.middle_of_overlap(problem, state, i, reference))[0])
         for i, camera in enumerate(state.cameras)
     ]
+    # Of the maps onto the reference camera's clock, in the middle of their common span.
+    lag_stds = [
+        _with_stamp_errors(std / base.rate, problem, state, i, reference)
+        if problem.free_parameters.clock and i != reference
+        else 0.0
+        for i, std in enumerate(cov.relative_clock_stds(covariance, problem, state)[reference].tolist())
+    ]
     cameras = {
         name: CameraCalibration(
             name=name,
@@ -120,7 +127,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             readout=_readout(rig, name, state.cameras[i].readout / time_scales[i]),
             readout_std=float(readout_stds[i]) / time_scales[i],
             lag_time=float(lag_times[i]) / time_scales[i] + time_origins[i],
-            lag_std=_lag_std(problem, state, covariance, i, reference) / time_scales[reference],
+            lag_std=lag_stds[i] / time_scales[reference],
             clock_rate_std=cov.clock_rate_std(covariance, state, i, reference)
             if problem.free_parameters.clock
             else 0.0,
@@ -321,16 +328,6 @@ def _time_map_std(
     if not problem.free_parameters.clock or camera == reference:
         return 0.0
     return _with_stamp_errors(cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference)
-
-
-def _lag_std(
-    problem: Problem, state: AdjustmentState, covariance: cov.Covariance, camera: int, reference: int
-) -> float:
-    """Std [s] of the map onto the reference camera's clock in the middle of their common span."""
-    if not problem.free_parameters.clock or camera == reference:
-        return 0.0
-    std = float(cov.relative_clock_stds(covariance, problem, state)[camera, reference])
-    return _with_stamp_errors(std / state.cameras[reference].rate, problem, state, camera, reference)
 
 
 def _with_stamp_errors(std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int) -> float:
