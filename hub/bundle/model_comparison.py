@@ -101,18 +101,23 @@ def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[LensTest]:
     kept = np.setdiff1d(np.arange(len(columns)), np.concatenate(list(lens.values())))
     out: list[LensTest] = []
     tangent = gauge_tangent(freed, state)
-    before = _reduction(normal, gradient, tangent, kept)[0]
     while len(out) < len(given):
-        left = [camera for camera in given if camera not in [one.camera for one in out]]
-        gains = {camera: _reduction(normal, gradient, tangent, np.union1d(kept, lens[camera])) for camera in left}
-        camera = max(left, key=lambda one: gains[one][0])
-        statistic = gains[camera][0] - before
-        if not statistic > limit:
+        _, step, covariance = _reduction(normal, gradient, tangent, kept)
+        found = []
+        for camera in set(given) - {one.camera for one in out}:
+            # What two parameters more lower the cost by: one step of them beside all others (Schur complement).
+            columns = lens[camera]
+            left = gradient[columns] + normal[columns] @ step
+            inverse = np.linalg.inv(
+                normal[np.ix_(columns, columns)] - normal[columns] @ covariance @ normal[:, columns]
+            )
+            statistic, std = float(left @ inverse @ left), float(np.sqrt(inverse[0, 0]))
+            found.append(LensTest(camera, -float(inverse[0] @ left), std, statistic, limit))
+        best = max(found, key=lambda one: one.statistic)
+        if not best.statistic > limit:
             break
-        kept, before = np.union1d(kept, lens[camera]), gains[camera][0]
-        focal = int(lens[camera][0])
-        step, covariance = gains[camera][1:]
-        out.append(LensTest(camera, float(step[focal]), float(np.sqrt(covariance[focal, focal])), statistic, limit))
+        kept = np.union1d(kept, lens[best.camera])
+        out.append(best)
     return out
 
 
