@@ -100,17 +100,14 @@ def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[LensTest]:
     limit = float(chdtri(2, _FALSE_ALARM_PROBABILITY / len(given)))
     kept = np.setdiff1d(np.arange(len(columns)), np.concatenate(list(lens.values())))
     out: list[LensTest] = []
-    tangent = gauge_tangent(freed, state)
     while len(out) < len(given):
-        _, step, covariance = _reduction(normal, gradient, tangent, kept)
+        _, step, covariance = _reduction(normal, gradient, gauge_tangent(freed, state), kept)
         found = []
         for camera in set(given) - {one.camera for one in out}:
             # What two parameters more lower the cost by: one step of them beside all others (Schur complement).
-            columns = lens[camera]
-            left = gradient[columns] + normal[columns] @ step
-            inverse = np.linalg.inv(
-                normal[np.ix_(columns, columns)] - normal[columns] @ covariance @ normal[:, columns]
-            )
+            two = lens[camera]
+            left = gradient[two] + normal[two] @ step
+            inverse = np.linalg.inv(normal[np.ix_(two, two)] - normal[two] @ covariance @ normal[:, two])
             statistic, std = float(left @ inverse @ left), float(np.sqrt(inverse[0, 0]))
             found.append(LensTest(camera, -float(inverse[0] @ left), std, statistic, limit))
         best = max(found, key=lambda one: one.statistic)

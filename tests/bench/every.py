@@ -58,6 +58,7 @@ BENCHES = {
     "lenses": Bench("focal lengths that nobody measured", ("--sessions", "3")),
     "shared_clock": Bench("separate points against the optimum", ("--seeds", "5")),
     "broken_cameras": Bench("what one broken camera costs", ("--seeds", "1")),
+    "street": Bench("a street of cameras, calibrated whole", ("--cameras", "20")),
     "poses": Bench("distributed poses against the joint optimum", ("--quick", "--rows", "section4,bearings")),
     "crowd": Bench("a crowd before seven cameras, boxes spoilt", ("--seeds", "2"), data=True),
     "hall": Bench("a simulated hall, offline and live", ("--people", "12", "--seconds", "6")),
