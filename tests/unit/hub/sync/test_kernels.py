@@ -153,3 +153,9 @@ def test_without_a_library_there_is_none(tmp_path: Path) -> None:
     foreign = tmp_path / "foreign.so"
     foreign.write_bytes(b"no library")
     assert kernels.load(foreign) is None
+
+
+def test_only_contiguous_arrays_are_handed_over() -> None:
+    assert kernels._at(np.zeros((3, 4)))
+    with pytest.raises(AssertionError, match="beside"):
+        kernels._at(np.zeros((3, 4)).T)
