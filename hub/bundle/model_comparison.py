@@ -36,9 +36,9 @@ from hub.bundle.problem import (
 )
 from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
+from hub.bundle.timestamp_jitter import weighted_by_jitter
 from hub.trajectory.banded import cho_solve_banded
-from protocols.geometry.types import Bools, Floats, Ints
-from protocols.session.rig import MAX_READOUT_S
+from protocols.geometry.types import Floats, Ints
 
 _FALSE_ALARM_PROBABILITY = 1e-4
 """Probability that one of the lenses of a correct rig is refuted."""
@@ -55,8 +55,6 @@ _STEP_CAMERAS = 3
 _TRIED_SHARE = 0.4
 """Of the statistic that is needed: in noise that holds its own effect a real step has less; on recorded flights those
 of 40 and 60 ms have 0.6 and more of it, and what is none at most 0.3."""
-_MIN_STEP_INFLATION = 4.0
-"""Rows per effective row below which no residuals are correlated, as a step's would be."""
 REFUTED_SIGMA = 4.0
 """Stds from which a rate is no crystal's: of a hundred cameras with crystals one in 160 is refuted."""
 _WIDE_FOCAL_STD, _WIDE_K1_STD = 0.5, 0.2
@@ -64,18 +62,18 @@ _WIDE_FOCAL_STD, _WIDE_K1_STD = 0.5, 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class LensTest:
-    """Score test of one measured lens. camera: index. focal_change: by which the observations would change the focal
-    length (relative), and its std. statistic: chi-squared of focal length and k1; refuted above limit."""
+class ScoreTest:
+    """Score test of a camera's measured lens or readout. camera: index. change: by which the observations would change
+    the focal length (relative) or the readout [s], and its std. statistic: chi-squared; they would above limit."""
 
     camera: int
-    focal_change: float
-    focal_std: float
+    change: float
+    std: float
     statistic: float
     limit: float
 
 
-def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[LensTest]:
+def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[ScoreTest]:
     """Measured lenses that the observations refute, most significant first.
 
     problem, state: adjusted with these lenses fixed. Forward selection: the lens whose focal length and k1 lower the
@@ -98,22 +96,33 @@ def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[LensTest]:
         camera: np.flatnonzero(np.isin(columns, camera * CAMERA_PARAMETERS + np.array([FOCAL, K1]))) for camera in given
     }
     limit = float(chdtri(2, _FALSE_ALARM_PROBABILITY / len(given)))
-    kept = np.setdiff1d(np.arange(len(columns)), np.concatenate(list(lens.values())))
-    out: list[LensTest] = []
-    while len(out) < len(given):
-        _, step, covariance = _reduction(normal, gradient, gauge_tangent(freed, state), kept)
+    return _forward_selection(normal, gradient, gauge_tangent(freed, state), lens, limit)
+
+
+def _forward_selection(
+    normal: Floats, gradient: Floats, tangent: Floats | None, candidates: dict[int, Ints], limit: float
+) -> list[ScoreTest]:
+    """Tests of the cameras whose parameters, freed one after the other, lower the cost by more than ``limit`` each.
+
+    normal (p, p), gradient (p,): of all parameters. tangent: (p, q) directions that keep the gauge. candidates: each
+    camera's columns; all other columns are free.
+    """
+    kept = np.setdiff1d(np.arange(len(gradient)), np.concatenate([np.zeros(0, dtype=np.int64), *candidates.values()]))
+    out: list[ScoreTest] = []
+    while len(out) < len(candidates):
+        _, step, covariance = _reduction(normal, gradient, tangent, kept)
         found = []
-        for camera in set(given) - {one.camera for one in out}:
-            # What two parameters more lower the cost by: one step of them beside all others (Schur complement).
-            two = lens[camera]
-            left = gradient[two] + normal[two] @ step
-            inverse = np.linalg.inv(normal[np.ix_(two, two)] - normal[two] @ covariance @ normal[:, two])
+        for camera in candidates.keys() - {one.camera for one in out}:
+            # What some parameters more lower the cost by: one step of them beside all others (Schur complement).
+            own = candidates[camera]
+            left = gradient[own] + normal[own] @ step
+            inverse = np.linalg.inv(normal[np.ix_(own, own)] - normal[own] @ covariance @ normal[:, own])
             statistic, std = float(left @ inverse @ left), float(np.sqrt(inverse[0, 0]))
-            found.append(LensTest(camera, -float(inverse[0] @ left), std, statistic, limit))
+            found.append(ScoreTest(camera, -float(inverse[0] @ left), std, statistic, limit))
         best = max(found, key=lambda one: one.statistic)
         if not best.statistic > limit:
             break
-        kept = np.union1d(kept, lens[best.camera])
+        kept = np.union1d(kept, candidates[best.camera])
         out.append(best)
     return out
 
@@ -141,43 +150,45 @@ def with_crystal_rates(problem: Problem, state: AdjustmentState) -> Problem:
     return replace(problem, crystal_rates=crystal)
 
 
+def are_readouts_observable(problem: Problem, state: AdjustmentState) -> bool:
+    """Whether the observations ask for the readout of a camera, beside wrong lenses and jitter.
+
+    problem, state: adjusted with fixed readouts. Forward selection, with noise scaled to the effective sample size.
+    """
+    linear, needed = _in_its_noise(problem, state), _evidence_needed(problem, 1, len(state.cameras))
+    tangent = gauge_tangent(linear.problem, state)
+    return bool(_forward_selection(linear.parts.reduced, linear.gradient, tangent, linear.readouts(), needed))
+
+
 def with_free_readouts(problem: Problem) -> Problem:
-    """The problem with all readouts free that were not given."""
+    """The problem with all readouts free that were not given.
+
+    Also of cameras that do not ask for it: where one rolls its shutter the others may, and held at 0 they bias it.
+    """
     return replace(problem, free_parameters=replace(problem.free_parameters, readout=True))
 
 
-def are_readouts_observable(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> bool:
-    """Whether free readouts lower the Bayesian information criterion, predicted by one step from the solution.
+def are_readouts_supported(problem: Problem, state: AdjustmentState) -> bool:
+    """Whether all estimated readouts are plausible and one of them is significant.
 
-    state: adjusted with fixed readouts.
+    A sensor is read from its first row to its last before the next frame, in at most `MAX_READOUT_S`; given readouts
+    may say otherwise.
     """
-    freed_problem = with_free_readouts(problem)
-    columns = freed_problem.free_columns()
-    readout_columns = columns % CAMERA_PARAMETERS == READOUT
-    if not readout_columns.any():
-        return False
-    rows = sum(int(part.use.sum()) for part in problem.rows)
-    bic_penalty = float(np.count_nonzero(readout_columns) * np.log(max(rows, 2)))
-    # Scaling by the effective sample size only lowers the gain, and usually there is none: test the cheap bound first.
-    if _cost_reduction(freed_problem, state, prior, readout_columns) < bic_penalty:
-        return False
-    inflation = correlation_inflation(problem, state)
-    return (
-        _cost_reduction(freed_problem, replace(state, sigma=state.sigma * np.sqrt(inflation)), prior, readout_columns)
-        > bic_penalty
+    linear, needed = _in_its_noise(problem, state), _evidence_needed(problem, 1, len(state.cameras))
+    values = {column: state.cameras[camera].readout for camera, (column,) in linear.readouts().items()}
+    return are_readouts_plausible(problem, state) and any(
+        value**2 > needed * linear.covariance[column, column] for column, value in values.items()
     )
 
 
 def are_readouts_plausible(problem: Problem, state: AdjustmentState) -> bool:
-    """Whether all readouts are within the range of real cameras: from 0 to a frame interval, and no longer than 0.1 s.
+    """Whether all readouts are within the range of real cameras: from 0 to a frame interval.
 
     A sensor is read from its first row to its last before the next frame; given readouts may say otherwise.
     """
     for number, camera in enumerate(state.cameras):
-        steps = [np.diff(np.unique(part.stamps)) for part in problem.rows if part.camera == number]
-        interval = min((float(np.median(step)) for step in steps if len(step)), default=MAX_READOUT_S)
-        margin = _READOUT_MARGIN * interval
-        if not -margin < camera.readout < min(interval + margin, MAX_READOUT_S):
+        longest = problem.longest_readout(number)
+        if not -_READOUT_MARGIN * longest < camera.readout < (1.0 + _READOUT_MARGIN) * longest:
             return False
     return True
 
@@ -189,17 +200,6 @@ def without_negative_readouts(problem: Problem, state: AdjustmentState) -> tuple
     cameras = [replace(one, readout=max(one.readout, 0.0)) for one in state.cameras]
     held = tuple(a or b for a, b in zip(given, below, strict=True))
     return replace(problem, readout_given=held), replace(state, cameras=tuple(cameras))
-
-
-def _cost_reduction(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, readout_columns: Bools) -> float:
-    """Predicted decrease of the cost in one step when the columns ``readout_columns`` (p,) are freed too."""
-    _, normal, gradient = _reduced_system(problem, state, prior)
-    tangent = gauge_tangent(problem, state)
-    everything = np.arange(len(gradient))
-    return (
-        _reduction(normal, gradient, tangent, everything)[0]
-        - _reduction(normal, gradient, tangent, everything[~readout_columns])[0]
-    )
 
 
 def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> tuple[Ints, Floats, Floats]:
@@ -233,13 +233,11 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     """
     if not problem.free_parameters.clock:
         return None
-    problem = _with_rows_of_a_step(problem, state)
+    problem, state = weighted_by_jitter(_with_rows_of_a_step(problem, state), state)
     inflation = correlation_inflation(problem, state)
-    if inflation.max() < _MIN_STEP_INFLATION:
-        return None
     # A camera that steps has the most correlated residuals of all, for that reason: here it must not count for less.
     linear, trials = _Linearised.of(problem, state, state.sigma * np.sqrt(np.median(inflation))), []
-    needed = needed_for_a_step(problem)
+    needed = _needed_for_a_step(problem)
     for camera in range(len(state.cameras)):
         used = [part.time[part.use] for part in problem.rows if part.camera == camera]
         times = np.unique(np.concatenate([np.zeros(0), *used]))
@@ -258,17 +256,35 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     return None if best is None or best.statistic <= needed or abs(best.size) <= _MIN_STEP_S else best
 
 
-def needed_for_a_step(problem: Problem) -> float:
-    """The chi-squared that a clock step needs: by the Bayesian information criterion of its size, and by how many are
-    tried."""
+def is_step_supported(problem: Problem, step: ClockStep) -> bool:
+    """Whether a step's size, in the adjustment that estimates it, is as many stds as it takes to look for one.
+
+    What was a step of a linear model, in noise that it explained, may be little once it is estimated.
+    """
+    return (step.size / step.std) ** 2 > _needed_for_a_step(problem)
+
+
+def _needed_for_a_step(problem: Problem) -> float:
+    return _evidence_needed(problem, 2, _STEP_TIMES * len(problem.nominal))
+
+
+def _evidence_needed(problem: Problem, parameters: int, tried: int) -> float:
+    """The chi-squared that a clock's further parameters need: the Bayesian information criterion, for the best of so
+    many that are tried."""
     rows = sum(int(part.use.sum()) for part in problem.rows)
-    return float(2.0 * np.log(max(rows, 2)) + 2.0 * np.log(_STEP_TIMES * len(problem.nominal)))
+    return float(parameters * np.log(max(rows, 2)) + 2.0 * np.log(tried))
 
 
 def remaining_step(problem: Problem, state: AdjustmentState, camera: int, time: float) -> ClockStep:
     """What one Gauss-Newton step adds to a corrected clock step at camera time ``time``, with its std."""
-    linear = _Linearised.of(problem, state, state.sigma * np.sqrt(correlation_inflation(problem, state)))
-    return _with_its_noise(problem, state, linear, camera, np.array([time]))
+    linear = _in_its_noise(problem, state)
+    return _with_its_noise(linear.problem, state, linear, camera, np.array([time]))
+
+
+def _in_its_noise(problem: Problem, state: AdjustmentState) -> _Linearised:
+    """The model in which clocks are tested, in noise scaled to the effective sample size and with that of jitter."""
+    problem, state = weighted_by_jitter(problem, state)
+    return _Linearised.of(problem, state, state.sigma * np.sqrt(correlation_inflation(problem, state)))
 
 
 def _with_its_noise(
@@ -354,6 +370,12 @@ class _Linearised:
         directions: Floats = np.eye(len(system.gradient_cameras)) if tangent is None else tangent
         covariance = directions @ np.linalg.solve(directions.T @ parts.reduced @ directions, directions.T)
         return cls(wide, noisy, system, parts, path, system.gradient_cameras - system.border.T @ path, covariance)
+
+    def readouts(self) -> dict[int, Ints]:
+        """The column (1,) of each camera's readout that was not given."""
+        columns = self.problem.free_columns()
+        free = np.flatnonzero(columns % CAMERA_PARAMETERS == READOUT)
+        return {int(columns[k]) // CAMERA_PARAMETERS: np.array([k]) for k in free}
 
     def best_step(self, camera: int, times: Floats) -> tuple[ClockStep, Floats, Floats]:
         """The best of a camera's steps at camera times (k,); what the paths (m,) and the cameras (p,) do with it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,7 +129,8 @@ def camera_priors(problem: Problem, state: AdjustmentState) -> list[tuple[int, f
         base = camera * CAMERA_PARAMETERS
         terms = [(RATE, current.rate - reference_rate, problem.rate_std(camera))]
         if free_parameters.readout:
-            terms.append((READOUT, current.readout, free_parameters.readout_std))
+            # About 0, for global shutters, with the second moment of a uniform distribution.
+            terms.append((READOUT, current.readout, problem.longest_readout(camera) / math.sqrt(3.0)))
         lens_prior = problem.lens_prior(camera)
         if lens_prior is not None:
             terms.append((FOCAL, float(np.log(current.intrinsics.focal / lens_prior.focal)), lens_prior.focal_std))

@@ -12,6 +12,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.calibration import AdjustmentStep
+from protocols.session.rig import MAX_READOUT_S
 
 CAMERA_PARAMETERS = 18
 """Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9, readout 10; for
@@ -193,7 +194,6 @@ class FreeParameters:
     pose, clock, lens: whether poses, time maps, and focal length with k1 are estimated.
     readout: whether rolling-shutter readouts are. focal_std: prior std of log focal length. k1_std: prior std of k1.
     rate_std: prior std of a rate about 1 while it is not known whether the frame rate is the nominal one.
-    readout_std: prior std [s] of a readout about 0.
     """
 
     pose: bool = True
@@ -203,7 +203,6 @@ class FreeParameters:
     focal_std: float = 0.01
     k1_std: float = 0.02
     rate_std: float = 1e-3
-    readout_std: float = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,6 +231,11 @@ class Problem:
         """Prior std of a camera's rate about 1."""
         crystal = bool(self.crystal_rates) and self.crystal_rates[camera]
         return min(self.free_parameters.rate_std, CRYSTAL_RATE_STD) if crystal else self.free_parameters.rate_std
+
+    def longest_readout(self, camera: int) -> float:
+        """A sensor is read before its next frame [s]."""
+        steps = [np.diff(np.unique(part.stamps)) for part in self.rows if part.camera == camera]
+        return min([MAX_READOUT_S, *(float(np.median(step)) for step in steps if len(step))])
 
     def lens_prior(self, camera: int) -> LensPrior | None:
         """The prior of a lens whose parameters are all estimated; None = at most focal length and k1 are."""

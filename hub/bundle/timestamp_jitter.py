@@ -4,8 +4,8 @@ A webcam's timestamp is the time at which a frame was fetched, not exposed: it e
 independently in every frame. All labels of a frame are then displaced along their motion by one common time shift, and
 not across it; errors of lenses and paths have no preferred direction and are correlated from frame to frame. So one
 time shift a frame is estimated, with a Gaussian prior whose std (the jitter, estimated too) is the camera's,
-alternating with the adjustment. A single label then constrains the path across its motion more than along it. Mean and
-linear trend of the shifts are removed: they are the clock's offset and rate.
+alternating with the adjustment. A single label then constrains the path across its motion more than along it. What a
+clock's offset, rate, steps and a readout explain of the shifts is left to them.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtri
 
-from hub.bundle.adjustment import adjust
-from hub.bundle.problem import OFFSET, AdjustmentState, Problem
-from hub.bundle.residuals import linearise
+from hub.bundle.adjustment import adjust, estimate_noise
+from hub.bundle.covariance import Covariance
+from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, READOUT, AdjustmentState, Problem, TrackObservations
+from hub.bundle.residuals import LinearisedResiduals, linearise
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry.types import Bools, Floats, Ints
 
@@ -43,12 +44,13 @@ _MAX_JITTER_S = 0.1
 class _FrameRows:
     """Rows of one camera grouped by frame.
 
-    frame: (n,) index of a row's frame. stamp: (m,) timestamps [s]. residual: (n, 2) [px] at the timestamps. velocity:
-    (n, 2) of the point in the image [px/s].
+    frame: (n,) index of a row's frame. stamp: (m,) timestamps [s]. clock: (m, k) derivatives of a frame's time with
+    respect to the clock's parameters. residual: (n, 2) [px] at the timestamps. velocity: (n, 2) of the point [px/s].
     """
 
     frame: Ints
     stamp: Floats
+    clock: Floats
     residual: Floats
     velocity: Floats
 
@@ -87,18 +89,58 @@ def estimate_frame_times(
     return found, replace(fitted, jitter=jitter)
 
 
+def weighted_by_jitter(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
+    """Problem and state with rows weighed by the noise that jitter adds along their motion, where it is detected.
+
+    What is tested in them is then compared with jitter, whose errors are large where the motion is fast.
+    """
+    rows, found = list(problem.rows), False
+    for camera in range(len(state.cameras)):
+        frames = _frames(problem, problem, state, camera)
+        jitter = _jitter_std(frames, float(state.sigma[camera]))
+        if jitter:
+            across = _transverse(frames.residual, frames.velocity) / np.linalg.norm(frames.velocity, axis=1)
+            noise = max(_MAD_TO_SIGMA * float(np.median(np.abs(across))), _MIN_SIGMA_PX)
+            for index, part in enumerate(rows):
+                if part.camera == camera:
+                    speed = np.nan_to_num(np.linalg.norm(_velocity(part, state)[1], axis=1))
+                    relative = 1.0 if part.relative_std is None else part.relative_std
+                    rows[index] = replace(part, relative_std=np.hypot(relative, jitter * speed / noise))
+            found = True
+    if not found:
+        return problem, state
+    weighted = replace(problem, rows=tuple(rows))
+    return weighted, replace(state, sigma=estimate_noise(weighted, state))
+
+
+def with_jitter(found: Covariance, problem: Problem, state: AdjustmentState) -> Covariance:
+    """The covariance with what jitter adds to clocks and readouts: frame times are estimated given these.
+
+    That is the covariance of a regression of the frames' errors on the clock's parameters.
+    """
+    if state.jitter is None:
+        return found
+    cameras = found.cameras.copy()
+    for camera, jitter in enumerate(state.jitter.tolist()):
+        frames = _frames(problem, problem, state, camera)
+        if jitter and len(frames.stamp) > frames.clock.shape[1]:
+            free = [0, 1, 2] if found.cameras[(index := camera * CAMERA_PARAMETERS + READOUT), index] else [0, 1]
+            at = camera * CAMERA_PARAMETERS + np.array([OFFSET, RATE, READOUT])[free]
+            added = jitter**2 * np.linalg.pinv(frames.clock.T @ frames.clock)
+            cameras[np.ix_(at, at)] += added[np.ix_(free, free)]
+    return replace(found, cameras=cameras)
+
+
 def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: int) -> _FrameRows:
     """A camera's rows by frame, without those displaced across their motion, which no time shift explains.
 
     stamped: the problem with the original timestamps.
     """
-    stamps, residuals, velocities = [np.zeros(0)], [np.zeros((0, 2))], [np.zeros((0, 2))]
+    stamps, heights, residuals, velocities = [np.zeros(0)], [np.zeros(0)], [np.zeros((0, 2))], [np.zeros((0, 2))]
     for before, rows in zip(stamped.rows, current.rows, strict=True):
         if rows.camera != camera:
             continue
-        all_rows = np.ones(len(rows.time), dtype=np.bool_)
-        line = linearise(rows.using(all_rows), state.cameras[camera], state.trajectories[rows.label])
-        velocity = line.camera_jacobian[:, :, OFFSET] * state.cameras[camera].rate
+        line, velocity = _velocity(rows, state)
         residual = line.residual - velocity * (rows.time - before.time)[:, None]
         across = np.abs(_transverse(residual, velocity)) / np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
         good = line.valid & np.isfinite(across)
@@ -106,10 +148,29 @@ def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: 
             _MAD_TO_SIGMA * float(np.median(across[good])) if good.any() else 0.0, _MIN_SIGMA_PX
         )
         stamps.append(rows.stamps[good])
+        heights.append(state.cameras[camera].row_offset(rows.pixels[good]))
         residuals.append(residual[good])
         velocities.append(velocity[good])
     stamp, frame = np.unique(np.concatenate(stamps), return_inverse=True)
-    return _FrameRows(frame, stamp, np.concatenate(residuals), np.concatenate(velocities))
+    height = np.bincount(frame, np.concatenate(heights)) / np.bincount(frame)
+    clock = _clock_parameters(state, camera, stamp, height)
+    return _FrameRows(frame, stamp, clock, np.concatenate(residuals), np.concatenate(velocities))
+
+
+def _velocity(rows: TrackObservations, state: AdjustmentState) -> tuple[LinearisedResiduals, Floats]:
+    """All rows linearised, and their velocities (n, 2) [px/s]."""
+    every = rows.using(np.ones(len(rows.time), dtype=np.bool_))
+    line = linearise(every, state.cameras[rows.camera], state.trajectories[rows.label])
+    return line, line.camera_jacobian[:, :, OFFSET] * state.cameras[rows.camera].rate
+
+
+def _clock_parameters(state: AdjustmentState, camera: int, stamp: Floats, height: Floats) -> Floats:
+    """Derivatives (m, k) of frames' times with respect to offset, rate, readout and the sizes of clock steps.
+
+    stamp: (m,) timestamps [s]. height: (m,) mean image row of their observations relative to the middle one.
+    """
+    steps = [stamp >= step.time for step in state.clock_steps if step.camera == camera]
+    return np.column_stack([np.ones(len(stamp)), stamp - state.cameras[camera].centre, height, *steps])
 
 
 def _transverse(residual: Floats, velocity: Floats) -> Floats:
@@ -164,7 +225,7 @@ def _is_inlier(shift: Floats, information: Floats, sigma: float, jitter: float) 
 
 
 def _posterior_shifts(frames: _FrameRows, sigma: float, jitter: float) -> Floats:
-    """Posterior mean of each frame's time minus its timestamp (m,) [s] under the jitter prior, linear trend removed."""
+    """Posterior mean of each frame's time minus its timestamp (m,) [s] under the jitter prior, given the clock."""
     shift, information, transverse = _independent_shifts(frames, sigma)
     good = (information > 0.0) & _is_inlier(shift, information, sigma, jitter)
     if jitter == 0.0 or not good.any():
@@ -172,16 +233,9 @@ def _posterior_shifts(frames: _FrameRows, sigma: float, jitter: float) -> Floats
     # A common error of a frame's labels across the motion also exists along it: a lower bound of the frame's noise.
     noise = max(sigma**2, float((information * transverse**2)[good].mean()))
     weight = np.where(good, information / (noise + information * jitter**2), 0.0)
-    free = _detrended(frames.stamp, shift, weight)
+    root = np.sqrt(weight)
+    free = shift - frames.clock @ np.linalg.lstsq(frames.clock * root[:, None], shift * root, rcond=None)[0]
     return np.where(good, free * (information * jitter**2) / (noise + information * jitter**2), 0.0)
-
-
-def _detrended(time: Floats, values: Floats, weight: Floats) -> Floats:
-    """Values (n,) minus their weighted straight line, which belongs to the clock's offset and rate."""
-    centred = time - np.average(time, weights=weight)
-    line = np.column_stack([np.ones(len(time)), centred]) * np.sqrt(weight)[:, None]
-    fitted = np.linalg.lstsq(line, values * np.sqrt(weight), rcond=None)[0]
-    return np.asarray(values - fitted[0] - fitted[1] * centred)
 
 
 def _apply_shifts(stamped: Problem, parts: list[_FrameRows], shifts: list[Floats]) -> Problem:

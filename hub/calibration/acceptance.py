@@ -9,7 +9,7 @@ import numpy as np
 from hub.bundle import covariance as cov
 from hub.bundle.correlated_noise import MIN_INFLATION
 from hub.bundle.initialisation import Reconstruction, inlier_share
-from hub.bundle.model_comparison import LensTest, refuted_lenses
+from hub.bundle.model_comparison import ScoreTest, refuted_lenses
 from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.problem import AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
@@ -79,7 +79,7 @@ def least_certain_camera(reconstruction: Reconstruction) -> Failure | None:
     return _worst(_precision(reconstruction, _covariance(reconstruction)))
 
 
-def wrong_lens(problem: Problem, state: AdjustmentState) -> LensTest | None:
+def wrong_lens(problem: Problem, state: AdjustmentState) -> ScoreTest | None:
     """Test of the lens refuted by most, where that is far more than any lens changes in the field; else None.
 
     It need not be the most significant one: the others' residuals, which are small, show what it does to them. Without
@@ -94,9 +94,9 @@ def wrong_lens(problem: Problem, state: AdjustmentState) -> LensTest | None:
     return None if worst is None or _excess(worst) <= _WRONG_LENS else worst
 
 
-def _excess(test: LensTest) -> float:
+def _excess(test: ScoreTest) -> float:
     """By how much a focal length differs from the given one, less three stds; relative."""
-    return abs(test.focal_change) - 3.0 * test.focal_std
+    return abs(test.change) - 3.0 * test.std
 
 
 def _covariance(reconstruction: Reconstruction) -> cov.Covariance:

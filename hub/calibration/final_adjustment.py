@@ -13,14 +13,13 @@ from hub.bundle.initialisation import Reconstruction, sigma_limits
 from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.problem import AdjustmentState, ClockStep, Problem
 from hub.bundle.residuals import residual_norms
-from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.acceptance import misfits, wrong_lens
 from hub.calibration.pairs.pair_network import Progress
 from protocols.geometry.types import Floats
 
 MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2  # steps of all clocks in one recording; Gauss-Newton steps for each
-STEP_PARAMETERS, _STEP_TOLERANCE = 2, 0.5  # time and size; what is left of a size, in stds
+_STEP_TOLERANCE = 0.5  # what is left of a size, in stds
 _ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
 _MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 
@@ -32,8 +31,7 @@ def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem
         if step is None:
             break
         trial, found = _with_sizes(problem, state, step)
-        # What was a step of a linear model, in noise that it explained, may be little once it is estimated.
-        if any((one.size / one.std) ** 2 < model_comparison.needed_for_a_step(problem) for one in found.clock_steps):
+        if not all(model_comparison.is_step_supported(problem, one) for one in found.clock_steps):
             break
         problem, state = trial, found
     return problem, state
@@ -58,6 +56,17 @@ def _with_sizes(problem: Problem, state: AdjustmentState, new: ClockStep) -> tup
             break
         steps = [replace(one, size=one.size + more.size) for one, more in zip(steps, rest, strict=True)]
     return found, replace(trial, clock_steps=tuple(steps))
+
+
+def _with_readouts(problem: Problem, state: AdjustmentState, report: Progress) -> tuple[Problem, AdjustmentState]:
+    """Problem and state with readouts estimated where the observations ask for them."""
+    if not model_comparison.are_readouts_observable(problem, state):
+        return problem, state
+    report("adjusting the readouts", 0.78)
+    found, trial, _ = adjust(model_comparison.with_free_readouts(problem), state, rounds=2)
+    if any(camera.readout < 0.0 for camera in trial.cameras) and model_comparison.are_readouts_plausible(found, trial):
+        found, trial, _ = adjust(*model_comparison.without_negative_readouts(found, trial), rounds=2)
+    return (found, trial) if model_comparison.are_readouts_supported(found, trial) else (problem, state)
 
 
 def final_adjustment(
@@ -91,30 +100,16 @@ def final_adjustment(
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     if not (warm and online):
         problem, state = _with_clock_steps(problem, state)
+    if not online and problem.free_parameters.clock:
+        problem, state = _with_readouts(problem, state, report)
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
     problem = model_comparison.with_crystal_rates(problem, state)
     if refine_lenses and not warm:
         report("adjusting the lenses", 0.85)
         freed = replace(problem, free_parameters=replace(problem.free_parameters, lens=True))
         freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: report(text, 0.85))
-        if bic_prefers(freed_problem, freed_state, problem, state, 2 * len(state.cameras)):
+        if _bic_prefers(freed_problem, freed_state, problem, state, 2 * len(state.cameras)):
             problem, state = freed_problem, freed_state
-    if (
-        not online
-        and problem.free_parameters.clock
-        and model_comparison.are_readouts_observable(problem, state, estimate_smoothness(problem, state))
-    ):
-        report("adjusting the readouts", 0.9)
-        read_problem, read_state, _ = adjust(model_comparison.with_free_readouts(problem), state, rounds=2)
-        if any(camera.readout < 0.0 for camera in read_state.cameras) and model_comparison.are_readouts_plausible(
-            read_problem, read_state
-        ):
-            held = model_comparison.without_negative_readouts(read_problem, read_state)
-            read_problem, read_state, _ = adjust(*held, rounds=2)
-        if model_comparison.are_readouts_plausible(read_problem, read_state) and bic_prefers(
-            read_problem, read_state, problem, state, len(state.cameras)
-        ):
-            problem, state = read_problem, read_state
     adjusted = replace(reconstruction, problem=problem, state=state)
     if not online and (misfits(adjusted) or wrong_lens(problem, state)):
         return adjusted  # a camera that will be left out: its errors are no noise
@@ -143,7 +138,7 @@ def _refit_online(problem: Problem, state: AdjustmentState, refine_lenses: bool)
     return (problem, state) if refitted[1] is state else refitted
 
 
-def bic_prefers(
+def _bic_prefers(
     freed: Problem, freed_state: AdjustmentState, fixed: Problem, fixed_state: AdjustmentState, parameters: int
 ) -> bool:
     """Whether ``parameters`` more are justified (Bayesian information criterion).

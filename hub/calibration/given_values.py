@@ -8,7 +8,7 @@ import numpy as np
 
 from hub.bundle.bordered_system import eliminate
 from hub.bundle.covariance import Covariance
-from hub.bundle.model_comparison import LensTest, refuted_lenses
+from hub.bundle.model_comparison import ScoreTest, refuted_lenses
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
@@ -20,9 +20,9 @@ _LENS_STD = 0.01
 """Relative std of a measured focal length for which no std is given: as `--refine-lenses` allows for."""
 
 
-def refuted_lens(test: LensTest) -> str:
+def refuted_lens(test: ScoreTest) -> str:
     """What the observations say about a measured lens."""
-    change, std = 100 * test.focal_change, 100 * test.focal_std
+    change, std = 100 * test.change, 100 * test.std
     return (
         "its measured lens is refuted by the observations, which give a focal length "
         f"{change:+.2g} % ± {std:.1g} % off (chi-squared {test.statistic:.0f} for focal length and k1, "

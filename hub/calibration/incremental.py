@@ -11,7 +11,7 @@ ones did, was moved: its older rows are dropped, and it is located again by rese
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,10 +23,10 @@ from hub.bundle.initialisation import (
     triangulate_and_adjust,
 )
 from hub.bundle.preprocessing import PreparedSession, prepare
-from hub.bundle.problem import CameraState, FreeParameters
+from hub.bundle.problem import CameraState, ClockStep, FreeParameters
 from hub.bundle.residuals import residual_norms
 from hub.calibration.acceptance import least_certain_camera, misfits
-from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, STEP_PARAMETERS, bic_prefers, final_adjustment
+from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, final_adjustment
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
 from hub.calibration.pipeline import calibrate
@@ -188,42 +188,56 @@ def _with_clock_steps(
 
     prepared, reconstruction = start(steps, last)
     for _ in range(MAX_CLOCK_STEPS + 1):
-        found = _clock_step(reconstruction, prepared, steps)
+        found = _clock_step(steps, prepared, reconstruction)
         if found is None:
             break
-        name, step, parameters = found
+        name, step = found
         trial_steps, trial_last = with_step(steps, name, step), with_clock_set(last, name, step[1])
         trial = start(trial_steps, trial_last)
-        before, after = reconstruction, trial[1]
-        if before.names != after.names or not bic_prefers(
-            after.problem, after.state, before.problem, before.state, parameters
-        ):
+        if trial[1].names != reconstruction.names or not _are_supported(trial_steps, *trial):
             break
         steps, last, (prepared, reconstruction) = trial_steps, trial_last, trial
     return on_newest_clock(observations, steps), last, (prepared, reconstruction), steps
 
 
 def _clock_step(
-    reconstruction: Reconstruction, prepared: PreparedSession, steps: Mapping[str, tuple[Step, ...]]
-) -> tuple[str, Step, int] | None:
-    """A camera's clock step that its rows show, on the corrected clock, and its number of new parameters.
+    steps: Mapping[str, tuple[Step, ...]], prepared: PreparedSession, reconstruction: Reconstruction
+) -> tuple[str, Step] | None:
+    """A camera's clock step that its rows show, on the corrected clock.
 
     First one that is not known; then what is left of a known one, where that is more than its std.
     """
-    problem, state = reconstruction.problem, reconstruction.state
-    found, new = model_comparison.find_clock_step(problem, state), STEP_PARAMETERS
-    for name in () if found is not None else [name for name in reconstruction.names if name in steps]:
-        scale, origin = prepared.time_scale(name), prepared.time_origins[name]
-        for step in steps[name]:
-            at = scale * (shown_since(steps, name, step) - origin)
-            left = model_comparison.remaining_step(problem, state, reconstruction.names.index(name), at)
+    found = model_comparison.find_clock_step(reconstruction.problem, reconstruction.state)
+    if found is None:
+        for scale, step, left in _remaining_steps(steps, prepared, reconstruction):
             if abs(left.size) > left.std or left.std < _BETTER_KNOWN * scale * step[2]:
-                found, new = left, 0
+                found = left
     if found is None:
         return None
     name = reconstruction.names[found.camera]
     scale = prepared.time_scale(name)
-    return name, (found.time / scale + prepared.time_origins[name], found.size / scale, found.std / scale), new
+    return name, (found.time / scale + prepared.time_origins[name], found.size / scale, found.std / scale)
+
+
+def _remaining_steps(
+    steps: Mapping[str, tuple[Step, ...]], prepared: PreparedSession, reconstruction: Reconstruction
+) -> Iterator[tuple[float, Step, ClockStep]]:
+    """(time scale, step, what the rows add to it) of each corrected step."""
+    for number, name in enumerate(reconstruction.names):
+        scale, origin = prepared.time_scale(name), prepared.time_origins[name]
+        for step in steps.get(name, ()):
+            at = scale * (shown_since(steps, name, step) - origin)
+            yield scale, step, model_comparison.remaining_step(reconstruction.problem, reconstruction.state, number, at)
+
+
+def _are_supported(
+    steps: Mapping[str, tuple[Step, ...]], prepared: PreparedSession, reconstruction: Reconstruction
+) -> bool:
+    """Whether all steps are as large as a step has to be, in the adjustment to the rows on the corrected clocks."""
+    return all(
+        model_comparison.is_step_supported(reconstruction.problem, replace(left, size=scale * step[1] + left.size))
+        for scale, step, left in _remaining_steps(steps, prepared, reconstruction)
+    )
 
 
 def _with_steps(found: Calibration, steps: Mapping[str, tuple[Step, ...]]) -> Calibration:

@@ -19,6 +19,7 @@ from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
+from hub.bundle.timestamp_jitter import with_jitter
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
 from hub.calibration.pairs.pair_network import RATE_TOLERANCE, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
@@ -86,6 +87,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     prior = estimate_smoothness(problem, state)
     scaled = rescale_noise(problem, state, prior)
     covariance = cov.covariance(problem, scaled, prior, gauge.information, datum_points, gauge.exact)
+    covariance = with_jitter(covariance, problem, state)
     effects = sensitivities(rig, names, problem, scaled, prior, covariance)
     lens_stds = focal_stds(problem, state, covariance)
     readout_stds = np.sqrt(np.maximum(np.diag(covariance.cameras)[READOUT::CAMERA_PARAMETERS], 0.0))
@@ -106,7 +108,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     ]
     # Of the maps onto the reference camera's clock, in the middle of their common span.
     lag_stds = [
-        _with_stamp_errors(std / base.rate, problem, state, i, reference)
+        _with_step_errors(std / base.rate, problem, state, i, reference)
         if problem.free_parameters.clock and i != reference
         else 0.0
         for i, std in enumerate(cov.relative_clock_stds(covariance, problem, state)[reference].tolist())
@@ -327,16 +329,11 @@ def _time_map_std(
 ) -> float:
     if not problem.free_parameters.clock or camera == reference:
         return 0.0
-    return _with_stamp_errors(cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference)
+    return _with_step_errors(cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference)
 
 
-def _with_stamp_errors(std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int) -> float:
+def _with_step_errors(std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int) -> float:
     variance = std**2
-    if state.jitter is not None:
-        # The map refers to the mean time stamp: its variance includes that of the mean of so many jittered stamps.
-        for one in (camera, reference):
-            stamps = [rows.stamps[rows.use] for rows in problem.rows if rows.camera == one]
-            variance += float(state.jitter[one]) ** 2 / max(len(np.unique(np.concatenate(stamps))), 1)
     for step in state.clock_steps:
         if step.camera in (camera, reference):  # its size moves the map by the share of the rows beyond it
             rows = [rows.time[rows.use] for rows in problem.rows if rows.camera == step.camera]
