@@ -155,7 +155,10 @@ def are_readouts_observable(problem: Problem, state: AdjustmentState) -> bool:
 
     problem, state: adjusted with fixed readouts. Forward selection, with noise scaled to the effective sample size.
     """
-    linear, needed = _in_its_noise(problem, state), _evidence_needed(problem, 1, len(state.cameras))
+    linear, needed = (
+        _in_its_noise(*weighted_by_jitter(problem, state)),
+        _evidence_needed(problem, 1, len(state.cameras)),
+    )
     tangent = gauge_tangent(linear.problem, state)
     return bool(_forward_selection(linear.parts.reduced, linear.gradient, tangent, linear.readouts(), needed))
 
@@ -174,7 +177,10 @@ def are_readouts_supported(problem: Problem, state: AdjustmentState) -> bool:
     A sensor is read from its first row to its last before the next frame, in at most `MAX_READOUT_S`; given readouts
     may say otherwise.
     """
-    linear, needed = _in_its_noise(problem, state), _evidence_needed(problem, 1, len(state.cameras))
+    linear, needed = (
+        _in_its_noise(*weighted_by_jitter(problem, state)),
+        _evidence_needed(problem, 1, len(state.cameras)),
+    )
     values = {column: state.cameras[camera].readout for camera, (column,) in linear.readouts().items()}
     return are_readouts_plausible(problem, state) and any(
         value**2 > needed * linear.covariance[column, column] for column, value in values.items()
@@ -277,13 +283,13 @@ def _evidence_needed(problem: Problem, parameters: int, tried: int) -> float:
 
 def remaining_step(problem: Problem, state: AdjustmentState, camera: int, time: float) -> ClockStep:
     """What one Gauss-Newton step adds to a corrected clock step at camera time ``time``, with its std."""
+    problem, state = weighted_by_jitter(problem, state)
     linear = _in_its_noise(problem, state)
-    return _with_its_noise(linear.problem, state, linear, camera, np.array([time]))
+    return _with_its_noise(problem, state, linear, camera, np.array([time]))
 
 
 def _in_its_noise(problem: Problem, state: AdjustmentState) -> _Linearised:
-    """The model in which clocks are tested, in noise scaled to the effective sample size and with that of jitter."""
-    problem, state = weighted_by_jitter(problem, state)
+    """The model in which clocks are tested, in noise scaled to the effective sample size."""
     return _Linearised.of(problem, state, state.sigma * np.sqrt(correlation_inflation(problem, state)))
 
 
@@ -302,7 +308,7 @@ def _with_its_noise(
     corrected = replace(corrected, correlated_noise=estimate_correlated_noise(left, corrected))
     modelled = [modelled_inflation(left, corrected, one) for one in range(len(state.cameras))]
     inflation = np.maximum(correlation_inflation(left, corrected), modelled)
-    sigma = estimate_noise(left, corrected) * np.sqrt(inflation)
+    sigma = state.sigma * estimate_noise(left, corrected) / estimate_noise(problem, state) * np.sqrt(inflation)
     step, _, _ = _Linearised.of(problem, state, sigma).best_step(camera, times)
     effective = 2.0 * sum(int(part.use.sum()) for part in problem.rows if part.camera == camera) / inflation[camera]
     return replace(step, statistic=float(effective * np.log1p(step.statistic / effective)))

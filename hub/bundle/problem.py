@@ -232,6 +232,10 @@ class Problem:
         crystal = bool(self.crystal_rates) and self.crystal_rates[camera]
         return min(self.free_parameters.rate_std, CRYSTAL_RATE_STD) if crystal else self.free_parameters.rate_std
 
+    def is_readout_free(self, camera: int) -> bool:
+        """Whether a camera's readout is estimated."""
+        return self.free_parameters.readout and not (self.readout_given and self.readout_given[camera])
+
     def longest_readout(self, camera: int) -> float:
         """A sensor is read before its next frame [s]."""
         steps = [np.diff(np.unique(part.stamps)) for part in self.rows if part.camera == camera]
@@ -253,7 +257,7 @@ class Problem:
                 columns += [base + OFFSET, base + RATE]
             if self.free_parameters.lens or self.lens_prior(camera) is not None:
                 columns += [base + FOCAL, base + K1]
-            if self.free_parameters.readout and not (self.readout_given and self.readout_given[camera]):
+            if self.is_readout_free(camera):
                 columns.append(base + READOUT)
             if self.lens_prior(camera) is not None:
                 columns += range(base + CENTRE, base + (P1 if self.nominal[camera].fisheye else CAMERA_PARAMETERS))

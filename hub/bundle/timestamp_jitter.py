@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtri
 
-from hub.bundle.adjustment import adjust, estimate_noise
+from hub.bundle.adjustment import adjust
 from hub.bundle.covariance import Covariance
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, READOUT, AdjustmentState, Problem, TrackObservations
 from hub.bundle.residuals import LinearisedResiduals, linearise
@@ -92,25 +92,26 @@ def estimate_frame_times(
 def weighted_by_jitter(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
     """Problem and state with rows weighed by the noise that jitter adds along their motion, where it is detected.
 
-    What is tested in them is then compared with jitter, whose errors are large where the motion is fast.
+    What is tested in them is then compared with jitter. All rows of a frame share its error: together they tell a time
+    with variance jitter² + noise² / sum of squared speeds.
     """
-    rows, found = list(problem.rows), False
+    rows, sigma = list(problem.rows), state.sigma.copy()
     for camera in range(len(state.cameras)):
         frames = _frames(problem, problem, state, camera)
         jitter = _jitter_std(frames, float(state.sigma[camera]))
-        if jitter:
-            across = _transverse(frames.residual, frames.velocity) / np.linalg.norm(frames.velocity, axis=1)
-            noise = max(_MAD_TO_SIGMA * float(np.median(np.abs(across))), _MIN_SIGMA_PX)
-            for index, part in enumerate(rows):
-                if part.camera == camera:
-                    speed = np.nan_to_num(np.linalg.norm(_velocity(part, state)[1], axis=1))
-                    relative = 1.0 if part.relative_std is None else part.relative_std
-                    rows[index] = replace(part, relative_std=np.hypot(relative, jitter * speed / noise))
-            found = True
-    if not found:
-        return problem, state
-    weighted = replace(problem, rows=tuple(rows))
-    return weighted, replace(state, sigma=estimate_noise(weighted, state))
+        if not jitter:
+            continue
+        across = _transverse(frames.residual, frames.velocity) / np.linalg.norm(frames.velocity, axis=1)
+        noise = sigma[camera] = max(_MAD_TO_SIGMA * float(np.median(np.abs(across))), _MIN_SIGMA_PX)
+        mine = [index for index, part in enumerate(rows) if part.camera == camera]
+        square = [np.nan_to_num(np.square(_velocity(rows[index], state)[1]).sum(axis=1)) for index in mine]
+        _, frame = np.unique(np.concatenate([rows[index].stamps for index in mine]), return_inverse=True)
+        of_frame = np.bincount(frame, np.concatenate(square))[frame]
+        for index, own in zip(mine, np.split(of_frame, np.cumsum([len(one) for one in square])[:-1]), strict=True):
+            relative = rows[index].relative_std
+            wider = np.sqrt(1.0 + jitter**2 * own / noise**2)
+            rows[index] = replace(rows[index], relative_std=wider if relative is None else relative * wider)
+    return replace(problem, rows=tuple(rows)), replace(state, sigma=sigma)
 
 
 def with_jitter(found: Covariance, problem: Problem, state: AdjustmentState) -> Covariance:
@@ -123,11 +124,11 @@ def with_jitter(found: Covariance, problem: Problem, state: AdjustmentState) -> 
     cameras = found.cameras.copy()
     for camera, jitter in enumerate(state.jitter.tolist()):
         frames = _frames(problem, problem, state, camera)
-        if jitter and len(frames.stamp) > frames.clock.shape[1]:
-            free = [0, 1, 2] if found.cameras[(index := camera * CAMERA_PARAMETERS + READOUT), index] else [0, 1]
-            at = camera * CAMERA_PARAMETERS + np.array([OFFSET, RATE, READOUT])[free]
-            added = jitter**2 * np.linalg.pinv(frames.clock.T @ frames.clock)
-            cameras[np.ix_(at, at)] += added[np.ix_(free, free)]
+        if jitter:
+            at = camera * CAMERA_PARAMETERS + np.array([OFFSET, RATE, READOUT])
+            at = at[: 2 + problem.is_readout_free(camera)]
+            clock = frames.clock[:, : len(at)]
+            cameras[np.ix_(at, at)] += jitter**2 * np.linalg.pinv(clock.T @ clock)
     return replace(found, cameras=cameras)
 
 
@@ -153,7 +154,7 @@ def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: 
         velocities.append(velocity[good])
     stamp, frame = np.unique(np.concatenate(stamps), return_inverse=True)
     height = np.bincount(frame, np.concatenate(heights)) / np.bincount(frame)
-    clock = _clock_parameters(state, camera, stamp, height)
+    clock = _clock_parameters(current, state, camera, stamp, height)
     return _FrameRows(frame, stamp, clock, np.concatenate(residuals), np.concatenate(velocities))
 
 
@@ -164,13 +165,15 @@ def _velocity(rows: TrackObservations, state: AdjustmentState) -> tuple[Linearis
     return line, line.camera_jacobian[:, :, OFFSET] * state.cameras[rows.camera].rate
 
 
-def _clock_parameters(state: AdjustmentState, camera: int, stamp: Floats, height: Floats) -> Floats:
-    """Derivatives (m, k) of frames' times with respect to offset, rate, readout and the sizes of clock steps.
+def _clock_parameters(problem: Problem, state: AdjustmentState, camera: int, stamp: Floats, height: Floats) -> Floats:
+    """Derivatives (m, k) of frames' times with respect to a clock's free parameters.
 
-    stamp: (m,) timestamps [s]. height: (m,) mean image row of their observations relative to the middle one.
+    They are offset, rate, readout if it is free, and the sizes of clock steps. stamp: (m,) timestamps [s]. height: (m,)
+    mean image row of their observations relative to the middle one.
     """
+    readout = [height] if problem.is_readout_free(camera) else []
     steps = [stamp >= step.time for step in state.clock_steps if step.camera == camera]
-    return np.column_stack([np.ones(len(stamp)), stamp - state.cameras[camera].centre, height, *steps])
+    return np.column_stack([np.ones(len(stamp)), stamp - state.cameras[camera].centre, *readout, *steps])
 
 
 def _transverse(residual: Floats, velocity: Floats) -> Floats:

@@ -1,16 +1,19 @@
-"""Which model of a camera's clock is chosen: an even clock, a step, a rolling shutter's readout, jitter of the stamps.
+"""What is made of a camera's clock: even, with a step, with a rolling shutter's readout, with jitter of its stamps.
 
-    python -m tests.bench.clock_models [--sessions 6] [--first 7000] [--only step30,...] [--seconds 40] [--jobs 2]
+    python -m tests.bench.clock_models [--sessions 4] [--first 7000] [--only step30,readouts+jitter] [--verbose]
+        [--seconds 40] [--noise 0.5] [--fps 30,25,29.97,50] [--fastest 0.7] [--focal-error 0] [--labels 1]
 
-Four cameras round one path, calibrated once for each effect put into the first, a random one or all of the cameras.
-Chosen: cameras by what was put in (rows) and what is reported (columns); errors of sizes over their stds.
+Four cameras round one path, calibrated once with each effect put into a random camera, or into all (plural): a step in
+ms, half a frame interval of readout, jitter in ms (std). Found: reported of that camera (a step within 5 s, its size to
+a half). Wrong: any other; of a readout, more than 3 stds from its truth. z: errors over their stds. --focal-error:
+relative error (std) of given focal lengths. --fastest: largest frequency of the motion [Hz].
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import sys
+import re
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -23,123 +26,185 @@ import numpy as np  # noqa: E402
 
 from hub.calibration.pipeline import calibrate  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
+from protocols.geometry.types import Floats  # noqa: E402
+from protocols.session.calibration import Calibration  # noqa: E402
+from protocols.session.observations import Observations  # noqa: E402
+from protocols.session.rig import Rig  # noqa: E402
 from tests.support import rigs  # noqa: E402
-from protocols.session.observations import Observations, Track
 
-# name: (step [s], readout / frame interval, jitter [s], of all cameras)
-EFFECTS = {
-    "none": (0, 0, 0, False),
-    "step15": (0.015, 0, 0, False),
-    "step30": (0.03, 0, 0, False),
-    "step60": (0.06, 0, 0, False),
-    "readout": (0, 0.5, 0, False),
-    "readouts": (0, 0.5, 0, True),
-    "jitter5": (0, 0, 0.005, False),
-    "jitter20": (0, 0, 0.02, False),
-    "jitters5": (0, 0, 0.005, True),
-    "step30+readouts": (0.03, 0.5, 0, True),
-    "step30+jitter": (0.03, 0, 0.01, False),
-    "readout+jitter": (0, 0.5, 0.005, False),
-}
+CAMERAS = 4
+EFFECTS = (
+    "none,step15,step30,step60,readout,readouts,jitter5,jitter20,jitters5,step30+readouts,step30+jitter10,"
+    "step30+jitters10,readout+jitter5,readouts+jitters10"
+)
+_PART = re.compile(r"(step|readout|jitter)(s?)(\d*)")
+_NEAR_S, _NEAR_SHARE, _WRONG_Z = 5.0, 0.5, 3.0
 
 
-def session(seed, effect, seconds, fps, noise, focal_error=0.0):
-    step, share, jitter, every = EFFECTS[effect]
+@dataclass(frozen=True, slots=True)
+class World:
+    """What all sessions have in common."""
+
+    seconds: float
+    noise: float
+    fps: tuple[float, ...]
+    fastest: float
+    focal_error: float
+    labels: int
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """A camera's effects, put in or reported: steps as (camera time, size, std), readout with std, jitter [s]."""
+
+    steps: tuple[tuple[float, float, float], ...] = ()
+    readout: float = 0.0
+    readout_std: float = 0.0
+    jitter: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One calibration: by camera what was put in and what is reported (None: refused)."""
+
+    clocks: dict[str, tuple[Clock, Clock | None]]
+    cpu: float
+
+
+def session(seed: int, effect: str, world: World) -> tuple[Rig, Observations, dict[str, Clock]]:
+    """One session and the clocks of its cameras, a pure function of its arguments."""
     rng = np.random.default_rng([seed, 31])
-    one = rigs.simulate(seed, 4, seconds, fps=fps, noise=0.0, ppm=50.0, drops=0.0, fastest=float(os.environ.get("FASTEST", "0.7")))
-    chosen = f"cam{rng.integers(4)}"
-    path = one.paths["object"] if "object" in one.paths else next(iter(one.paths.values()))
-    tracks = {}
-    truth = {}
-    obs = one.observations()
-    rig_c = dict(one.rig.cameras)
-    for (name, label), t in obs.tracks.items():
-        cam = one.rig.cameras[name]
-        readout = share / cam.fps if (every or name == chosen) else 0.0
-        jit = jitter if (every or name == chosen) else 0.0
-        true = np.array([one.true_time(name, float(s)) for s in t.time])
-        v = np.full(len(true), 360.0)
-        for _ in range(4):
-            p = cam.intrinsics.project(one.poses[name].camera_from_world(path.at(true + readout * (v / 720 - 0.5))))
-            v = p[:, 1]
-        p = p + rng.normal(0, noise, p.shape)
-        stamps = t.time.copy()
-        at = size = 0.0
-        if step and name == chosen:
-            at = t.time[0] + rng.uniform(0.25, 0.75) * np.ptp(t.time)
-            size = step * rng.choice([-1.0, 1.0])
-            stamps = stamps + np.where(t.time >= at, size, 0.0)
-        if jit:
-            stamps = stamps + rng.normal(0, jit, len(stamps))
-        with np.errstate(invalid="ignore"):
-            ok = ((p >= 0) & (p < rigs.SIZE)).all(axis=1) & (rng.random(len(p)) > 0.05)
-        ok &= np.diff(np.maximum.accumulate(stamps), prepend=-np.inf) > 0
-        truth[name] = (at, size, readout, jit)
-        tracks[name, label] = replace(t, time=stamps, pixels=p).select(ok)
-        if focal_error:
-            m = cam.intrinsics.matrix.copy(); m[:2, :2] *= 1 + rng.normal(0, focal_error)
-            rig_c[name] = replace(cam, intrinsics=replace(cam.intrinsics, matrix=m))
-    return one, replace(one.rig, cameras=rig_c), Observations(tracks), truth, chosen
+    labels = {f"point{i}": range(CAMERAS) for i in range(world.labels)}
+    one = rigs.simulate(
+        seed, CAMERAS, world.seconds, fps=world.fps, noise=0.0, ppm=50.0, drops=0.0, fastest=world.fastest,
+        labels=labels,
+    )  # fmt: skip
+    chosen, sign, share = f"cam{rng.integers(CAMERAS)}", float(rng.choice([-1.0, 1.0])), float(rng.uniform(0.25, 0.75))
+    cameras, clocks, tracks = dict(one.rig.cameras), dict[str, Clock](), {}
+    for name, camera in one.rig.cameras.items():
+        parts = {kind: float(size or 0) for kind, every, size in _PART.findall(effect) if every or name == chosen}
+        own = [track for (of, _), track in one.observations().tracks.items() if of == name]
+        begin, end = min(track.time[0] for track in own), max(track.time[-1] for track in own)
+        clock = Clock(
+            ((float(begin + share * (end - begin)), 1e-3 * sign * parts["step"], 0.0),) if "step" in parts else (),
+            0.5 / camera.fps if "readout" in parts else 0.0,
+            jitter=1e-3 * parts.get("jitter", 0.0),
+        )
+        clocks[name] = clock
+        errors = rng.normal(0.0, clock.jitter, max(int(track.frame.max()) for track in own) + 1)
+        for track in own:
+            stamps = track.time + errors[track.frame]
+            for at, size, _ in clock.steps:
+                stamps = stamps + np.where(track.time >= at, size, 0.0)
+            pixels = _pixels(one, name, track.label, track.time, clock.readout)
+            pixels += rng.normal(0.0, world.noise, pixels.shape)
+            with np.errstate(invalid="ignore"):
+                seen = ((pixels >= 0) & (pixels < rigs.SIZE)).all(axis=1) & (rng.random(len(pixels)) > 0.05)
+            seen &= np.diff(np.maximum.accumulate(stamps), prepend=-np.inf) > 0.0
+            tracks[name, track.label] = replace(track, time=stamps, pixels=pixels).select(seen)
+        matrix = camera.intrinsics.matrix.copy()
+        matrix[:2, :2] *= 1.0 + rng.normal(0.0, world.focal_error)
+        cameras[name] = replace(camera, intrinsics=replace(camera.intrinsics, matrix=matrix))
+    return replace(one.rig, cameras=cameras), Observations(tracks), clocks
 
 
-def one(task, seconds, noise, fps, focal_error):
-    effect, seed = task
-    s, rig, obs, truth, chosen = session(seed, effect, seconds, fps, noise, focal_error)
+def _pixels(one: rigs.Session, name: str, label: str, shown: Floats, readout: float) -> Floats:
+    """Pixels (n, 2) of a label in frames whose middle rows are read at camera times (n,)."""
+    true = one.clocks[name].clock_rate * shown + one.clocks[name].time_offset
+    lens, pose, late = one.rig.cameras[name].intrinsics, one.poses[name], np.zeros(len(true))
+    for _ in range(4):
+        pixels = lens.project(pose.camera_from_world(one.paths[label].at(true + late)))
+        late = readout * (np.nan_to_num(pixels[:, 1]) / (rigs.SIZE[1] - 1) - 0.5)
+    return np.asarray(pixels)
+
+
+def reported(found: Calibration, name: str) -> Clock | None:
+    """What a calibration says of a camera's clock."""
+    if name not in found.cameras:
+        return None
+    jitter = [re.match(name + r": its stamps jitter by ([\d.e-]+) ms", text) for text in found.warnings]
+    one = found.cameras[name]
+    stds = [1e-3 * float(match[1]) for match in jitter if match]
+    return Clock(one.clock_steps, one.readout, one.readout_std, max(stds, default=0.0))
+
+
+def run(task: tuple[str, int], world: World) -> Run:
+    """One session calibrated."""
+    rig, observations, clocks = session(task[1], task[0], world)
     began = time.process_time()
     try:
-        found = calibrate(rig, obs)
-    except Refused as e:
-        return effect, seed, None, str(e), time.process_time() - began
-    out = []
-    for name, (at, size, readout, jit) in truth.items():
-        c = found.cameras.get(name)
-        if c is None:
-            out.append((name, (at, size, readout, jit), None)); continue
-        out.append((name, (at, size, readout, jit), (c.clock_steps, c.readout, getattr(c, "readout_std", 0.0), next((float(w.split("jitter by ")[1].split(" ms")[0]) * 1e-3 for w in found.warnings if w.startswith(name + ": its stamps jitter by ")), 0.0))))
-    return effect, seed, out, s.turn_error({k: v.pose for k, v in found.cameras.items()}) if len(found.cameras) == 4 else -1, time.process_time() - began
+        found = calibrate(rig, observations)
+    except Refused:
+        return Run({name: (clock, None) for name, clock in clocks.items()}, time.process_time() - began)
+    cpu = time.process_time() - began
+    return Run({name: (clock, reported(found, name)) for name, clock in clocks.items()}, cpu)
 
 
-def main():
-    ap = argparse.ArgumentParser()
-    ap.add_argument("--sessions", type=int, default=6)
-    ap.add_argument("--first", type=int, default=7000)
-    ap.add_argument("--only", default=",".join(EFFECTS))
-    ap.add_argument("--seconds", type=float, default=40.0)
-    ap.add_argument("--noise", type=float, default=0.5)
-    ap.add_argument("--focal-error", type=float, default=0.0)
-    ap.add_argument("--fps", default="30,25,29.97,50")
-    ap.add_argument("--jobs", type=int, default=1)
-    ap.add_argument("-v", action="store_true")
-    o = ap.parse_args()
-    fps = tuple(float(x) for x in o.fps.split(","))
-    tasks = [(e, s) for e in o.only.split(",") for s in range(o.first, o.first + o.sessions)]
-    with ProcessPoolExecutor(o.jobs) as pool:
-        res = list(pool.map(partial(one, seconds=o.seconds, noise=o.noise, fps=fps, focal_error=o.focal_error), tasks))
-    print(f"{'effect':>18} refused steps:found/put wrong  readouts:found/put wrong  jitter:found/put wrong  rms z readout, step, ratio jitter  cpu")
-    for e in o.only.split(","):
-        mine = [r for r in res if r[0] == e]
-        ref = sum(r[2] is None for r in mine); refc = 0
-        sp = sf = sw = rp = rf = rw = jp = jf = jw = 0
-        zs, zr, js = [], [], []
-        for r in mine:
-            for name, (at, size, readout, jit), got in r[2] or []:
-                if got is None:
-                    refc += 1; continue
-                steps, ro, ros, j = got
-                j = j or 0.0
-                sp += size != 0; rp += readout != 0; jp += jit != 0
-                hit = [x for x in steps if size and abs(x[1] - size) < 0.5 * abs(size) and abs(x[0] - at) < 5]
-                sf += bool(hit); sw += len(steps) - bool(hit)
-                zs += [(hit[0][1] - size) / hit[0][2]] if hit else []
-                if readout: rf += ro > 0
-                else: rw += ro > 0
-                if ro > 0 and ros: zr.append((ro - readout) / ros)
-                if jit: jf += j > 0
-                else: jw += j > 0
-                if jit and j: js.append(j / jit)
-                if o.v: print(e, r[1], name, "truth", (round(at,2), size, round(readout*1e3,2), jit), "got", [tuple(round(float(v),4) for v in x) for x in steps], "ro %.2f±%.2f ms" % (1e3*ro, 1e3*(ros or 0)), "jit", j)
-        rms = lambda z: np.sqrt(np.mean(np.square(z))) if z else np.nan
-        print(f"{e:>18} {ref}+{refc:<4} {sf:3}/{sp:<3} {sw:3}       {rf:3}/{rp:<3} {rw:3}     {jf:3}/{jp:<3} {jw:3}     {rms(zr):.2f} {rms(zs):.2f} {np.mean(js) if js else np.nan:.2f}  turn {np.degrees(np.median([r[3] for r in mine if r[2]] or [0])):.3f} cpu {np.mean([r[4] for r in mine]):.1f}", flush=True)
+def row(effect: str, runs: list[Run]) -> str:
+    """The table's line of one effect."""
+    put = dict.fromkeys(("step", "readout", "jitter"), 0)
+    found, wrong, z = dict(put), dict(put), {kind: list[float]() for kind in put}
+    refused = 0
+    for true, said in (pair for one in runs for pair in one.clocks.values()):
+        if said is None:
+            refused += 1
+            continue
+        for kind, there in (("step", true.steps), ("readout", true.readout), ("jitter", true.jitter)):
+            put[kind] += bool(there)
+        hits = [
+            (step, size - of, std)
+            for at, of, _ in true.steps
+            for step in said.steps
+            for when, size, std in [step]
+            if abs(when - at) < _NEAR_S and abs(size - of) < _NEAR_SHARE * abs(of)
+        ]
+        found["step"] += bool(hits)
+        wrong["step"] += len(said.steps) - len(hits)
+        z["step"] += [error / std for _, error, std in hits]
+        if said.readout_std > 0.0:
+            z["readout"].append((said.readout - true.readout) / said.readout_std)
+            wrong["readout"] += abs(z["readout"][-1]) > _WRONG_Z
+        found["readout"] += true.readout > 0.0 and said.readout > 0.0
+        found["jitter"] += true.jitter > 0.0 and said.jitter > 0.0
+        wrong["jitter"] += true.jitter == 0.0 and said.jitter > 0.0
+        if true.jitter and said.jitter:
+            z["jitter"].append(said.jitter / true.jitter)
+    cells = [f"{found[kind]:>3} of {put[kind]:<3}{wrong[kind]:>3} wrong, {_rms(z[kind]):4.2f}" for kind in put]
+    return f"{effect:>20} {refused:>4}   {'   '.join(cells)}   {np.mean([one.cpu for one in runs]):5.2f} s"
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else np.nan
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sessions", type=int, default=4)
+    parser.add_argument("--first", type=int, default=7000, help="first seed")
+    parser.add_argument("--only", default=EFFECTS)
+    parser.add_argument("--seconds", type=float, default=40.0)
+    parser.add_argument("--noise", type=float, default=0.5, help="px")
+    parser.add_argument("--fps", default="30,25,29.97,50")
+    parser.add_argument("--fastest", type=float, default=0.7, help="Hz")
+    parser.add_argument("--focal-error", type=float, default=0.0)
+    parser.add_argument("--labels", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--verbose", action="store_true", help="what was put in and reported, by camera")
+    options = parser.parse_args()
+    world = World(
+        options.seconds, options.noise, tuple(map(float, options.fps.split(","))), options.fastest,
+        options.focal_error, options.labels,
+    )  # fmt: skip
+    print(f"{'effect':>20} refused  {'step: rms z':>22}   {'readout: rms z':>22}   {'jitter: of its truth':>22}")
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for effect in options.only.split(","):
+            tasks = [(effect, seed) for seed in range(options.first, options.first + options.sessions)]
+            runs = list(pool.map(partial(run, world=world), tasks))
+            print(row(effect, runs), flush=True)
+            for number, one in enumerate(runs if options.verbose else []):
+                for name, pair in one.clocks.items():
+                    print(f"    {options.first + number} {name}: {pair[0]} -> {pair[1]}")
+
 
 if __name__ == "__main__":
     main()
