@@ -67,7 +67,8 @@ class TrackObservations:
     camera, label: indices. time: (n,) on the camera's clock relative to its epoch [s]. pixels: (n, 2) distorted.
     use: (n,) inliers. stamp: (n,) the frames' original timestamps where ``time`` differs from them, because it is
     corrected for a given readout or by an estimated frame time (`timestamp_jitter`). relative_std: (n,) std of each
-    row's noise relative to the camera's typical row, by the detector's covariances; None = all alike.
+    row's noise relative to the camera's typical row, by the detector's covariances; None = all alike. along_std: (n,)
+    std along the row's motion relative to that across it, by jitter of the stamps; None = alike.
     """
 
     camera: int
@@ -77,6 +78,7 @@ class TrackObservations:
     use: Bools
     stamp: Floats | None = None
     relative_std: Floats | None = None
+    along_std: Floats | None = None
 
     @property
     def stamps(self) -> Floats:

@@ -60,7 +60,8 @@ class ResidualEvaluation:
     finite but meaningless. time: (n,) on the camera's clock, corrected for readout. index, weights, slope_weights:
     support in ``control`` (size, 3), the path's or all paths' control points. camera_points: (3, n) in camera axes.
     normalised: (2, n) undistorted. distortion_jacobian: (n, 2, 2) derivative of distorted by undistorted coordinates,
-    where it was computed with the residuals. relative_information: (n,) of the rows, by their relative stds.
+    where it was computed with the residuals. relative_information: (n,) of the rows, by their relative stds. along: the
+    directions of motion (2, n), and by what residuals and Jacobians are shortened along them (n,); None = not at all.
     """
 
     residual: Floats
@@ -75,6 +76,15 @@ class ResidualEvaluation:
     normalised: Floats
     distortion_jacobian: Floats | None
     relative_information: Floats
+    along: tuple[Floats, Floats] | None = None
+
+    def whitened(self, vectors: Floats) -> Floats:
+        """Vectors (2, ..., n) shortened along the motion."""
+        if self.along is None:
+            return vectors
+        direction, factor = self.along
+        direction = direction.reshape(2, *[1] * (vectors.ndim - 2), -1)
+        return np.asarray(vectors + direction * ((factor - 1.0) * (direction * vectors).sum(axis=0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +155,17 @@ def evaluate_labels(
     points = weighted_sums(paths.control, index, weights)
     information = 1.0 / np.square(np.concatenate([part.used_relative_std for part in parts]))
     support = SplineSupport(paths.control, index, weights, slope_weights)
-    return evaluate_points(camera, points, inside, time, pixels, support, information)
+    evaluation = evaluate_points(camera, points, inside, time, pixels, support, information)
+    if all(part.along_std is None for part in parts):
+        return evaluation
+    velocity = jacobians(evaluation, camera, [OFFSET])[:, 3]
+    direction = velocity / np.maximum(np.linalg.norm(velocity, axis=0), 1e-9)
+    wider = [
+        np.ones(len(rows)) if part.along_std is None else part.along_std[rows]
+        for part, rows in zip(parts, used, strict=True)
+    ]
+    evaluation = replace(evaluation, along=(direction, 1.0 / np.concatenate(wider)))
+    return replace(evaluation, residual=evaluation.whitened(evaluation.residual))
 
 
 def evaluate_points(
@@ -237,7 +257,7 @@ def jacobians(evaluation: ResidualEvaluation, camera: CameraState, columns: Sequ
             if radius2 is None:
                 radius2 = (normalised**2).sum(axis=0)
             values[:] = _lens_jacobian(evaluation, lens, column, radius2)
-    return out
+    return evaluation.whitened(out)
 
 
 def _lens_jacobian(evaluation: ResidualEvaluation, lens: Intrinsics, column: int, radius2: Floats) -> Floats:

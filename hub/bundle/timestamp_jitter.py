@@ -17,8 +17,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from hub.bundle.adjustment import adjust
-from hub.bundle.covariance import Covariance
-from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, READOUT, AdjustmentState, Problem, TrackObservations
+from hub.bundle.problem import OFFSET, AdjustmentState, Problem, TrackObservations
 from hub.bundle.residuals import LinearisedResiduals, linearise
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry.types import Bools, Floats, Ints
@@ -90,15 +89,15 @@ def estimate_frame_times(
 
 
 def weighted_by_jitter(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
-    """Problem and state with rows weighed by the noise that jitter adds along their motion, where it is detected.
+    """Problem and state whose rows have the noise that jitter adds along their motion, where it is detected.
 
-    What is tested in them is then compared with jitter. All rows of a frame share its error: together they tell a time
-    with variance jitter² + noise² / sum of squared speeds.
+    What is tested in them is compared with jitter, and covariances are those of frame times that are estimated too. All
+    rows of a frame share its error: together they tell a time with variance jitter² + noise² / sum of squared speeds.
     """
     rows, sigma = list(problem.rows), state.sigma.copy()
     for camera in range(len(state.cameras)):
         frames = _frames(problem, problem, state, camera)
-        jitter = _jitter_std(frames, float(state.sigma[camera]))
+        jitter = _jitter_std(frames, float(sigma[camera])) if state.jitter is None else float(state.jitter[camera])
         if not jitter:
             continue
         across = _transverse(frames.residual, frames.velocity) / np.linalg.norm(frames.velocity, axis=1)
@@ -108,28 +107,8 @@ def weighted_by_jitter(problem: Problem, state: AdjustmentState) -> tuple[Proble
         _, frame = np.unique(np.concatenate([rows[index].stamps for index in mine]), return_inverse=True)
         of_frame = np.bincount(frame, np.concatenate(square))[frame]
         for index, own in zip(mine, np.split(of_frame, np.cumsum([len(one) for one in square])[:-1]), strict=True):
-            relative = rows[index].relative_std
-            wider = np.sqrt(1.0 + jitter**2 * own / noise**2)
-            rows[index] = replace(rows[index], relative_std=wider if relative is None else relative * wider)
+            rows[index] = replace(rows[index], along_std=np.sqrt(1.0 + jitter**2 * own / noise**2))
     return replace(problem, rows=tuple(rows)), replace(state, sigma=sigma)
-
-
-def with_jitter(found: Covariance, problem: Problem, state: AdjustmentState) -> Covariance:
-    """The covariance with what jitter adds to clocks and readouts: frame times are estimated given these.
-
-    That is the covariance of a regression of the frames' errors on the clock's parameters.
-    """
-    if state.jitter is None:
-        return found
-    cameras = found.cameras.copy()
-    for camera, jitter in enumerate(state.jitter.tolist()):
-        frames = _frames(problem, problem, state, camera)
-        if jitter:
-            at = camera * CAMERA_PARAMETERS + np.array([OFFSET, RATE, READOUT])
-            at = at[: 2 + problem.is_readout_free(camera)]
-            clock = frames.clock[:, : len(at)]
-            cameras[np.ix_(at, at)] += jitter**2 * np.linalg.pinv(clock.T @ clock)
-    return replace(found, cameras=cameras)
 
 
 def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: int) -> _FrameRows:

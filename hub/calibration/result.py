@@ -19,7 +19,7 @@ from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
-from hub.bundle.timestamp_jitter import with_jitter
+from hub.bundle.timestamp_jitter import weighted_by_jitter
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
 from hub.calibration.pairs.pair_network import RATE_TOLERANCE, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
@@ -85,10 +85,10 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     else:
         gauge = identity_gauge(len(names), solution.known.scale)
     prior = estimate_smoothness(problem, state)
-    scaled = rescale_noise(problem, state, prior)
-    covariance = cov.covariance(problem, scaled, prior, gauge.information, datum_points, gauge.exact)
-    covariance = with_jitter(covariance, problem, state)
-    effects = sensitivities(rig, names, problem, scaled, prior, covariance)
+    noisy, scaled = (problem, state) if state.jitter is None else weighted_by_jitter(problem, state)
+    scaled = rescale_noise(noisy, scaled, prior)
+    covariance = cov.covariance(noisy, scaled, prior, gauge.information, datum_points, gauge.exact)
+    effects = sensitivities(rig, names, noisy, scaled, prior, covariance)
     lens_stds = focal_stds(problem, state, covariance)
     readout_stds = np.sqrt(np.maximum(np.diag(covariance.cameras)[READOUT::CAMERA_PARAMETERS], 0.0))
     time_origins = [solution.prepared.time_origins[name] for name in names]
