@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 import hub.calibration.final_adjustment
+from hub.bundle.problem import OFFSET, CameraState, TrackObservations, Trajectory
+from hub.bundle.residuals import linearise
 from hub.calibration.pipeline import calibrate
+from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.session.calibration import Calibration
 from tests.support import rigs
 
@@ -96,3 +99,26 @@ def test_correlated_errors_are_not_reported_as_jitter() -> None:
     pixels[mine] += moved[1] - moved[0]
     shifted = replace(session, pixels=pixels)
     assert not reported_jitters(calibrate(shifted.rig, shifted.observations()))
+
+
+def test_rows_with_jitter_have_its_covariance_along_their_motion() -> None:
+    """Whitened residuals and Jacobians against the inverse of noise² (1 + (along² - 1) u uᵀ)."""
+    rng = np.random.default_rng(SEED)
+    camera = CameraState(rigs.random_lens(rng), rigs.random_poses(rng, 1)[0], 1.0, 5.0, 5.0)
+    basis, grid = SplineBasis.covering(np.array([0.0]), np.array([10.0]), 0.25), np.arange(0.0, 10.0, 0.02)
+    path = Trajectory(basis, fit_spline(basis, basis.weights(grid), rigs.random_path(rng).at(grid), np.ones(len(grid))))
+    time = rng.uniform(0.5, 9.5, 40)
+    seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(camera.reference_time(time))))
+    rows = TrackObservations(0, 0, time, seen + rng.normal(0.0, 2.0, seen.shape), np.ones(40, dtype=np.bool_))
+    along = rng.uniform(1.0, 9.0, 40)
+    plain, white = linearise(rows, camera, path), linearise(replace(rows, along_std=along), camera, path)
+    velocity = plain.camera_jacobian[:, :, OFFSET]
+    unit = velocity / np.linalg.norm(velocity, axis=1)[:, None]
+    inverse = np.linalg.inv(np.eye(2) + (along**2 - 1.0)[:, None, None] * unit[:, :, None] * unit[:, None, :])
+    jacobians = [(one.camera_jacobian, one.point_jacobian) for one in (plain, white)]
+    for before, after in zip(*jacobians, strict=True):
+        expected = before.transpose(0, 2, 1) @ inverse @ before
+        np.testing.assert_allclose(after.transpose(0, 2, 1) @ after, expected, rtol=1e-9, atol=1e-9 * expected.max())
+        gradient = before.transpose(0, 2, 1) @ inverse @ plain.residual[:, :, None]
+        got = after.transpose(0, 2, 1) @ white.residual[:, :, None]
+        np.testing.assert_allclose(got, gradient, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
