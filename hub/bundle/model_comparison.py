@@ -403,7 +403,7 @@ class _Linearised:
         corner[mine] = cross[4:] @ after.T
         solved = cho_solve_banded(self.parts.factor, border)
         coupling = corner - system.border.T @ solved
-        score = after @ (weighted * seen.residual).sum(axis=0) - solved.T @ system.gradient_path
+        score = after @ (weighted * seen.whitened(seen.residual)).sum(axis=0) - solved.T @ system.gradient_path
         score -= coupling.T @ (self.covariance @ self.gradient)
         information = after @ cross[3] - (border * solved).sum(axis=0)
         information = np.maximum(information - (coupling * (self.covariance @ coupling)).sum(axis=0), 1e-9)

@@ -59,7 +59,7 @@ def weigh_residuals(
     for camera, parts in by_camera.items():
         residuals = evaluate_labels(parts, state.cameras[camera], paths)
         information = residuals.relative_information / state.sigma[camera] ** 2
-        squared = (residuals.residual[0] ** 2 + residuals.residual[1] ** 2) * information
+        squared = np.square(residuals.whitened(residuals.residual)).sum(axis=0) * information
         if robust:
             ratio = squared / CAUCHY_WIDTH**2
             weights.append(np.where(residuals.valid, information / (1.0 + ratio), 0.0))
@@ -100,7 +100,7 @@ def assemble(
         jacobian = jacobians(one, state.cameras[camera], (columns[camera_columns] % CAMERA_PARAMETERS).tolist())
         terms, root = np.empty((2, jacobian.shape[1] + 1, len(weight))), np.sqrt(weight)
         np.multiply(jacobian, root, out=terms[:, :-1])
-        np.multiply(one.residual, root, out=terms[:, -1])
+        np.multiply(one.whitened(one.residual), root, out=terms[:, -1])
         path_terms, camera_terms = blocks.add_rows(one.index, one.weights, terms)
         system.gradient_path += path_terms[:, -1]
         if len(camera_columns):

@@ -61,7 +61,7 @@ class ResidualEvaluation:
     support in ``control`` (size, 3), the path's or all paths' control points. camera_points: (3, n) in camera axes.
     normalised: (2, n) undistorted. distortion_jacobian: (n, 2, 2) derivative of distorted by undistorted coordinates,
     where it was computed with the residuals. relative_information: (n,) of the rows, by their relative stds. along: the
-    directions of motion (2, n), and by what residuals and Jacobians are shortened along them (n,); None = not at all.
+    directions of motion (2, n), and by what `whitened` ones are shortened along them (n,); None = not at all.
     """
 
     residual: Floats
@@ -164,8 +164,7 @@ def evaluate_labels(
         np.ones(len(rows)) if part.along_std is None else part.along_std[rows]
         for part, rows in zip(parts, used, strict=True)
     ]
-    evaluation = replace(evaluation, along=(direction, 1.0 / np.concatenate(wider)))
-    return replace(evaluation, residual=evaluation.whitened(evaluation.residual))
+    return replace(evaluation, along=(direction, 1.0 / np.concatenate(wider)))
 
 
 def evaluate_points(
@@ -291,7 +290,7 @@ def linearise(
     evaluation = evaluate_residuals(rows, camera, path)
     jacobian = jacobians(evaluation, camera, range(columns)).transpose(2, 0, 1)
     return LinearisedResiduals(
-        evaluation.residual.T,
+        evaluation.whitened(evaluation.residual).T,
         jacobian[:, :, :3],
         jacobian[:, :, 3:],
         evaluation.index,
