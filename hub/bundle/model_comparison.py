@@ -18,7 +18,7 @@ from scipy.special import chdtri
 
 from hub.bundle.adjustment import apply_step, estimate_noise, gauge_tangent
 from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, cho_solve_path, eliminate
-from hub.bundle.correlated_noise import lens_tolerance
+from hub.bundle.correlated_noise import MIN_INFLATION, lens_tolerance
 from hub.bundle.gauss_markov import estimate_correlated_noise
 from hub.bundle.noise_scale import correlation_inflation, modelled_inflation
 from hub.bundle.normal_equations import build_system
@@ -305,9 +305,11 @@ def _with_its_noise(
     left = with_clock_step(problem, step, -np.inf)
     left = replace(left, rows=tuple(a.using(b.use) for a, b in zip(left.rows, problem.rows, strict=True)))
     corrected = apply_step(linear.problem, state, path, cameras)
-    corrected = replace(corrected, correlated_noise=estimate_correlated_noise(left, corrected))
-    modelled = [modelled_inflation(left, corrected, one) for one in range(len(state.cameras))]
-    inflation = np.maximum(correlation_inflation(left, corrected), modelled)
+    inflation = correlation_inflation(left, corrected)
+    if inflation.max() >= MIN_INFLATION:
+        corrected = replace(corrected, correlated_noise=estimate_correlated_noise(left, corrected))
+        modelled = [modelled_inflation(left, corrected, one) for one in range(len(state.cameras))]
+        inflation = np.maximum(inflation, modelled)
     sigma = state.sigma * estimate_noise(left, corrected) / estimate_noise(problem, state) * np.sqrt(inflation)
     step, _, _ = _Linearised.of(problem, state, sigma).best_step(camera, times)
     effective = 2.0 * sum(int(part.use.sum()) for part in problem.rows if part.camera == camera) / inflation[camera]
