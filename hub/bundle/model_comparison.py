@@ -44,8 +44,8 @@ _FALSE_ALARM_PROBABILITY = 1e-4
 """Probability that one of the lenses of a correct rig is refuted."""
 _READOUT_MARGIN = 0.25
 """Error of an estimated readout, in frame intervals, that is plausible: a global shutter's comes out at about 0."""
-_STEP_TIMES, _MIN_STEP_ROWS = 24, 60
-"""Times at which a clock step is tried, and rows of a camera below which none is."""
+_STEP_TIMES, _MIN_STEP_FRAMES = 24, 30
+"""Times at which a clock step is tried, and frames on each side of one: as many as a camera of a network needs."""
 _MIN_STEP_S = 5e-3
 """Smallest clock step [s] that is reported: less is jitter or a wandering clock."""
 _MAX_STEP_S = 0.2
@@ -247,11 +247,13 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     for camera in range(len(state.cameras)):
         used = [part.time[part.use] for part in problem.rows if part.camera == camera]
         times = np.unique(np.concatenate([np.zeros(0), *used]))
-        if len(times) >= _MIN_STEP_ROWS:
-            first, last, width = 0.05 * (len(times) - 1), 0.95 * (len(times) - 1), 0.9 * len(times) / (_STEP_TIMES - 1)
-            trial = linear.best_step(camera, times[np.linspace(first, last, _STEP_TIMES).astype(int)])[0]
-            near = np.searchsorted(times, trial.time) + width * np.linspace(-1.0, 1.0, _STEP_TIMES)
-            trials.append((trial, times[np.clip(near, 1, len(times) - 1).astype(int)]))
+        if len(times) >= 2 * _MIN_STEP_FRAMES:
+            first = max(0.05 * len(times), _MIN_STEP_FRAMES)
+            tried = np.linspace(first, len(times) - first, _STEP_TIMES)
+            trial = linear.best_step(camera, times[tried.astype(int)])[0]
+            near = np.searchsorted(times, trial.time) + (tried[1] - tried[0]) * np.linspace(-1.0, 1.0, _STEP_TIMES)
+            near = np.clip(near, _MIN_STEP_FRAMES, len(times) - _MIN_STEP_FRAMES)
+            trials.append((trial, times[near.astype(int)]))
     trials = sorted(trials, key=lambda one: -one[0].statistic)[:_STEP_CAMERAS]
     found = [
         _with_its_noise(problem, state, linear, trial.camera, near)
