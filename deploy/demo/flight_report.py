@@ -79,7 +79,7 @@ def _map(states: Sequence[pb.TargetState], world: FlightWorld) -> str:
             dots = "".join(f'<circle cx="{at(x)}" cy="{at(y)}" r="2"/>' for x, y in zip(*xy(path), strict=True))
             parts.append(f'<g fill="{_COLOURS[state]}">{dots}</g>')
     height = 2.0 * _MARGIN_PX + scale * float(high[0] - low[0])
-    metres = _scale_bar_length(float((high - low).max()))
+    metres = float(10.0 ** np.floor(np.log10(max(0.4 * float((high - low).max()), 1.0))))
     parts.append(
         f'<path d="M{at(_MARGIN_PX)} {at(height - 8)}h{at(scale * metres)}" stroke="#1b2430" stroke-width="3"/>'
     )
@@ -87,10 +87,6 @@ def _map(states: Sequence[pb.TargetState], world: FlightWorld) -> str:
     lead = "Grey: true path. Green: estimated while the car was visible. Orange: estimated while it was out of view."
     label = "Map of the car's true path and of the agent's estimates"
     return f'<p class="lead">{lead}</p>{drawing(_MAP_PX[0], height, parts, label)}'
-
-
-def _scale_bar_length(span: float) -> float:
-    return float(10.0 ** np.floor(np.log10(max(0.4 * span, 1.0))))
 
 
 def _select_report_frames(states: Sequence[pb.TargetState], world: FlightWorld) -> list[_ReportFrame]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 from collections.abc import Sequence
@@ -120,7 +121,7 @@ def rig_figure_script(figure: RigFigure) -> str:
             centres,
             "markers+text",
             "cameras",
-            text=[f"<b>{_markup(name)}</b>" for name in names],
+            text=[f"<b>{html.escape(name, quote=False)}</b>" for name in names],
             textposition="bottom center",
             textfont={"color": _NAVY, "size": 14},
             marker={"color": _NAVY, "size": 4},
@@ -193,10 +194,6 @@ def _trace(rows: Rows, mode: str, name: str, **more: Any) -> dict[str, Any]:
 
 def _round(value: float) -> float:
     return float(f"{value:.5g}") + 0.0
-
-
-def _markup(name: str) -> str:
-    return name.replace("&", "&amp;").replace("<", "&lt;")
 
 
 def _script_safe(value: Any) -> str:

@@ -56,11 +56,6 @@ def session_to_log(rig: Rig, observations: Observations, out: Path, arrivals: Ar
     return _write_log(out, infos, rig, _with_log_times(_observation_messages(rig, observations), arrivals))
 
 
-def has_objects(folder: Path) -> bool:
-    """Whether a session folder holds detections of objects, several of one label in a frame, or boxes."""
-    return _objects_file(folder) is not None
-
-
 def objects_to_log(
     folder: Path, calibration: Path | None, out: Path, arrivals: Arrivals | None
 ) -> tuple[Rig, int, int]:
@@ -71,7 +66,7 @@ def objects_to_log(
     calibration: gives cameras and lenses in place of the folder's rig.toml. Returns the rig, and the numbers of
     detections and messages. Raises InputError.
     """
-    file = _objects_file(folder)
+    file = objects_file(folder)
     assert file is not None
     if calibration is None and not (folder / RIG_FILE).exists():
         raise InputError(f"no {RIG_FILE} in this folder", file=folder, remedy="give --calibration CALIB.toml")
@@ -84,7 +79,7 @@ def objects_to_log(
     return rig, len(rows), _write_log(out, infos, rig, _with_log_times(messages, arrivals))
 
 
-def _objects_file(folder: Path) -> Path | None:
+def objects_file(folder: Path) -> Path | None:
     file = folder / OBSERVATIONS_FILE
     if not file.exists():
         boxes = folder / BOXES_FILE

@@ -96,7 +96,8 @@ def plan_install(role: str, file: Path, program: str | None = None) -> Plan:
             _set(table, path, _source(value, file, path))
         else:
             place, content = _referenced(value, file, path, folder, taken)
-            plan.add(place, content, 0o600 if _is_secret(value) else 0o640)
+            secret = value.suffix in (".key", ".pem") or "key" in value.stem
+            plan.add(place, content, 0o600 if secret else 0o640)
             base = place.rpartition("/")[2]
             small = len(content) <= _CREDENTIAL_BYTES
             if small:
@@ -319,10 +320,6 @@ def _referenced(value: Path, file: Path, path: tuple[str, ...], folder: str, tak
     base = value.name if value.name not in taken else f"{'-'.join(path)}-{value.name}"
     taken.add(base)
     return f"{folder}/{base}", content
-
-
-def _is_secret(file: Path) -> bool:
-    return file.suffix in (".key", ".pem") or "key" in file.stem
 
 
 def _running_program() -> str:

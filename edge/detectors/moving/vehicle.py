@@ -59,13 +59,8 @@ class VehicleDetector(SilhouetteDetector):
         super().__init__(model, fps, prefix, 1.0, confirmed_only, _MAX_PIXELS)
         self._motion_given = moving
         self._shifts: deque[float] = deque(maxlen=_DECISION_FRAMES)
-        self._moving = bool(moving)
+        self.moving = bool(moving)
         self._compensated = _CompensatedBackground()
-
-    @property
-    def moving(self) -> bool:
-        """Whether the camera is assumed to move."""
-        return self._moving
 
     def initialise(self, images: Sequence[Image]) -> None:
         """Learn a fixed camera's background from images over a longer time; no effect for a moving camera."""
@@ -77,8 +72,8 @@ class VehicleDetector(SilhouetteDetector):
             travel = _camera_shift(small)
             if travel is None:
                 return  # decided at the first frames
-            self._motion_given = self._moving = travel > _MOVING_TRAVEL_PX
-        if self._moving:
+            self._motion_given = self.moving = travel > _MOVING_TRAVEL_PX
+        if self.moving:
             return
         self._foreground.initialise(small)
 
@@ -95,7 +90,7 @@ class VehicleDetector(SilhouetteDetector):
         self._set_size(image)
         now = self._advance(time_s)
         small = self._downscaled(image)
-        if self._motion_given is None or self._moving:
+        if self._motion_given is None or self.moving:
             self._decide_camera_motion(small)
         foreground = self._foreground_mask(small, now)
         if foreground is None:
@@ -127,15 +122,15 @@ class VehicleDetector(SilhouetteDetector):
         if self._motion_given is not None or len(self._shifts) < _DECISION_FRAMES:
             return
         typical = float(np.median(self._shifts))
-        if not self._moving and typical > _MOVING_SHIFT_PX:
-            self._moving = True
-        elif self._moving and typical < 0.3 * _MOVING_SHIFT_PX and max(self._shifts) < _MOVING_SHIFT_PX:
-            self._moving = False
+        if not self.moving and typical > _MOVING_SHIFT_PX:
+            self.moving = True
+        elif self.moving and typical < 0.3 * _MOVING_SHIFT_PX and max(self._shifts) < _MOVING_SHIFT_PX:
+            self.moving = False
             self._foreground = BackgroundSubtractor(self._model, self._fps)
 
     def _foreground_mask(self, image: Image, now: float) -> Image | None:
         """Silhouettes (H, W) 0/255; None while the background is unknown."""
-        if self._moving:
+        if self.moving:
             raw = self._compensated.moving_pixels(image)
         else:
             if self._motion_given is None and len(self._shifts) < _DECISION_FRAMES:

@@ -194,7 +194,7 @@ def densest_cluster(points: Floats, weights: Floats, radius: float) -> Cluster:
     around = np.zeros(len(cells))
     for dx in (-1, 0, 1):
         for dy in (-1, 0, 1):
-            wanted = cells + _key_step(dx, dy)
+            wanted = cells + dx * _STRIDES[0] + dy * _STRIDES[1]
             at = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
             around += np.where(cells[at] == wanted, mass[at], 0.0)
     fullest = inverse == int(np.argmax(around + 1e-9 * mass))
@@ -239,7 +239,3 @@ def _keys(index: Ints) -> Ints:
     if index.shape[1] > len(_STRIDES):
         return np.asarray(np.unique(index, axis=0, return_inverse=True)[1], dtype=np.int64).reshape(-1)
     return np.asarray(index @ np.array(_STRIDES[: index.shape[1]], dtype=np.int64), dtype=np.int64)
-
-
-def _key_step(dx: int, dy: int) -> int:
-    return dx * _STRIDES[0] + dy * _STRIDES[1]
