@@ -16,6 +16,7 @@ from hub.report.page import html_page, section
 from hub.report.svg import at, drawing, esc, points, text
 from hub.report.tables import table
 from protocols.core.files import write_atomically
+from protocols.core.jpeg import encode_jpeg
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
@@ -133,8 +134,6 @@ def _pictures(log: Path, states: Sequence[pb.TargetState], world: FlightWorld) -
 
 
 def _figure(message: pb.FlightImage, state: Any, clouds: Iterable[pb.TargetCloud], why: str) -> str:
-    import cv2
-
     from edge.uav.base import Estimate, TrackState
     from edge.uav.estimator import decode_image
     from edge.uav.operator_view import draw
@@ -147,10 +146,7 @@ def _figure(message: pb.FlightImage, state: Any, clouds: Iterable[pb.TargetCloud
     width, height = state.size if state.size else (nan, nan)
     particles = next((np.array(cloud.pixels).reshape(-1, 2) for cloud in clouds), None)
     estimate = Estimate(0.0, TrackState(state.state), x, y, width, height, nan, state.std_px, particles=particles)
-    good, data = cv2.imencode(".jpg", draw(image, estimate, state.state), [cv2.IMWRITE_JPEG_QUALITY, 80])
-    if not good:
-        return ""
-    source = f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}"
+    source = f"data:image/jpeg;base64,{base64.b64encode(encode_jpeg(draw(image, estimate, state.state), 80)).decode()}"
     caption_text = f"{state.state}, {why}" if why != state.state else why
     caption = f"<figcaption><small>Frame {message.frame}: {esc(caption_text)}.</small></figcaption>"
     return f'<figure><img src="{source}" alt="{esc(caption_text)}">{caption}</figure>'

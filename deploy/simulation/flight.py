@@ -14,6 +14,7 @@ from edge.uav.world import scenarios
 from edge.uav.world.flight_world import FlightWorld
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
+from protocols.core.jpeg import encode_jpeg
 from protocols.geometry import so3
 from protocols.session.folder import RIG_FILE
 
@@ -72,8 +73,7 @@ def _write_video(world: FlightWorld, out: Path) -> Path:
     folder = out / FRAMES_FOLDER
     folder.mkdir(exist_ok=True)
     for i in range(world.length):
-        _, data = cv2.imencode(".jpg", world.frame(i), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-        (folder / f"{i:06d}.jpg").write_bytes(data.tobytes())
+        (folder / f"{i:06d}.jpg").write_bytes(encode_jpeg(world.frame(i), _JPEG_QUALITY))
     return folder
 
 

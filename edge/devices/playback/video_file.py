@@ -28,8 +28,12 @@ def check_recording(path: Path) -> None:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The images in a folder, by name."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    """The images in a folder, by name. Raises InputError if there are none."""
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    if not files:
+        kinds = ", ".join(sorted(IMAGE_SUFFIXES))
+        raise InputError("no images in this folder", file=folder, remedy=f"put {kinds} files in it")
+    return files
 
 
 def read_image(file: Path) -> Image | None:
@@ -128,9 +132,6 @@ class VideoPlayback:
         check_recording(self._path)
         if self._path.is_dir():
             self._image_files = image_files(self._path)
-            if not self._image_files:
-                kinds = ", ".join(sorted(IMAGE_SUFFIXES))
-                raise InputError("no images in this folder", file=self._path, remedy=f"put {kinds} files in it")
             return self._read_image(0)
         if self._capture is not None:
             self._capture.release()
