@@ -11,7 +11,8 @@ import re
 import stat
 import tempfile
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +157,18 @@ def write_together(files: Mapping[Path, str]) -> None:
     finally:
         for temporary, _ in prepared:
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def completed_file(file: Path) -> Iterator[Path]:
+    """A path beside ``file`` to write to, of the same suffix; it replaces ``file`` at the end, unless that failed."""
+    temporary = file.with_name(f".{file.stem}.{os.getpid()}{file.suffix}")
+    temporary.unlink(missing_ok=True)
+    try:
+        yield temporary
+        temporary.replace(file)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def file_in(folder: Path, name: str) -> Path:

@@ -13,6 +13,7 @@ from deploy.offline.csv_table import read_csv_header
 from deploy.offline.follow.objects import BOXES_FILE, complete_detections, is_boxes_file, object_messages, read_objects
 from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.errors import InputError
+from protocols.core.files import completed_file
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration, read_calibration
@@ -113,8 +114,6 @@ def _write_log(out: Path, infos: Sequence[pb.CameraInfo], rig: Rig, frames: list
 
     if out.exists():
         raise InputError("this file exists already", file=out, remedy="choose another --out: logs are not replaced")
-    part = out.with_name(f".{out.stem}.part.mcap")
-    part.unlink(missing_ok=True)
     begins = {message.camera: at for at, message in reversed(frames)}
     boots = {message.camera: message.boot_id for _, message in frames}
     messages: list[tuple[int, Topic, str, Message]] = [(0, RIG_INFO, "import", _rig_info(rig))]
@@ -122,13 +121,9 @@ def _write_log(out: Path, infos: Sequence[pb.CameraInfo], rig: Rig, frames: list
         info.boot_id = boots.get(info.camera, info.boot_id)
         messages.append((begins.get(info.camera, 0), CAMERA_INFO, info.camera, info))
     messages += [(at, OBSERVATION, message.camera, message) for at, message in frames]
-    try:
-        with LogWriter(part, views=True) as writer:
-            for at, topic, name, message in sorted(messages, key=lambda entry: entry[0]):
-                writer.write(topic, name, "import", message, at)
-        part.replace(out)
-    finally:
-        part.unlink(missing_ok=True)
+    with completed_file(out) as part, LogWriter(part, views=True) as writer:
+        for at, topic, name, message in sorted(messages, key=lambda entry: entry[0]):
+            writer.write(topic, name, "import", message, at)
     return len(messages)
 
 

@@ -28,11 +28,9 @@ class Model(Protocol[Observation_contra]):
 
     def propagate(self, states: Floats, rng: np.random.Generator) -> Floats:
         """One draw from p(x_k | x_{k-1}) per particle: (n, d) -> (n, d)."""
-        ...
 
     def log_likelihood(self, states: Floats, observation: Observation_contra) -> Floats:
         """log p(y_k | x_k), up to a constant that is the same for all particles: (n, d) -> (n,)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,10 +53,6 @@ class Particles:
     def reweighted(self, log_likelihoods: Floats) -> Particles:
         """The posterior set: each weight times its likelihood (eq. 2.6), normalised (eq. 2.1)."""
         return Particles(self.states, normalise(self.log_weights + log_likelihoods))
-
-    def resampled(self, rng: np.random.Generator, count: int | None = None) -> Particles:
-        """count particles (default: the same number) of equal weight, drawn in proportion to the weights."""
-        return Particles.uniform(self.states[systematic_resample(self.weights, count or len(self.states), rng)])
 
 
 @dataclass(frozen=True, slots=True)
