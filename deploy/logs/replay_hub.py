@@ -41,13 +41,11 @@ def replay_through_hub(
     time, after the same messages on every machine. ``out`` is written atomically. Raises InputError.
     """
     reader = LogReader(log)
-    if out.exists():
-        raise InputError("exists already", file=out, remedy="choose another --out, or move it away")
     known = None if calibration is None else KnownCalibration(*read_calibration(calibration))
     recorded = next(reader.messages([SOLVER_EVENT]), None) if known is None and settings is None else None
     hub = ScheduledHub() if recorded is not None else LiveHub(settings, known=known)
     count, first_ns, now_ns, site = 0, None, 0, ""
-    with completed_file(out) as temporary, LogWriter(temporary, {"replay": {"through": "hub"}}) as writer:
+    with completed_file(out, new=True) as temporary, LogWriter(temporary, {"replay": {"through": "hub"}}) as writer:
 
         def publish(final: bool = False) -> int:
             published = hub.tick((now_ns - (first_ns or 0)) / NANOSECONDS, final=final)

@@ -34,13 +34,11 @@ def replay_through_uav(log: Path, out: Path) -> tuple[int, int]:
 
     cv2.setNumThreads(1)
     reader = LogReader(log)
-    if out.exists():
-        raise InputError("exists already", file=out, remedy="choose another --out, or move it away")
     infos = _infos(reader)
     estimators: dict[tuple[str, str], TargetEstimator] = {}
     next_order: dict[tuple[str, str], int] = {}
     count = missing = 0
-    with completed_file(out) as temporary, LogWriter(temporary, {"replay": {"through": "uav"}}) as writer:
+    with completed_file(out, new=True) as temporary, LogWriter(temporary, {"replay": {"through": "uav"}}) as writer:
         for logged in _in_order(reader):
             message: Any = logged.message
             name = (message.agent, message.boot_id)

@@ -135,7 +135,7 @@ def track_recording(
     *,
     start: int = 0,
     telemetry: Sequence[Telemetry] = (),
-    show: Callable[[Image, TrackedFrame], None] | None = None,
+    show: Callable[[Image, TrackedFrame], object] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[TrackedFrame]:
     """Run a tracker over an opened recording, from frame ``start`` on.

@@ -17,7 +17,7 @@ import tomli_w
 from deploy.config.file import KnownName, Source, load
 from deploy.site.install import units
 from protocols.core.errors import InputError, Refused
-from protocols.core.files import read_toml
+from protocols.core.files import read_toml, write_private
 from protocols.core.names import key_segment
 from protocols.session.rig import read_rig
 
@@ -184,7 +184,8 @@ def apply(plan: Plan, root: Path) -> list[str]:
             now = _in(root, place)
             if now.is_file() and now.read_bytes() == content and now.stat().st_mode & 0o777 == plan.modes[place]:
                 continue
-            _write(now, content, plan.modes[place])
+            now.parent.mkdir(parents=True, exist_ok=True)
+            write_private(now, content, plan.modes[place])
             changes.append(f"wrote {place}")
         for place, target in plan.links.items():
             now = _in(root, place)
@@ -213,21 +214,6 @@ def _commands(plan: Plan, *, changed: bool) -> list[list[str]]:
     return [
         ["systemctl", "start", *command[2:]] for command in plan.commands if command[:2] == ["systemctl", "restart"]
     ]
-
-
-def _write(place: Path, content: bytes, mode: int) -> None:
-    place.parent.mkdir(parents=True, exist_ok=True)
-    beside = place.with_name(f".{place.name}.new")
-    handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    try:
-        with os.fdopen(handle, "wb") as out:
-            out.write(content)
-            out.flush()
-            os.fsync(out.fileno())
-        beside.chmod(mode)
-        beside.replace(place)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def _run(commands: list[list[str]], changes: list[str]) -> None:

@@ -62,10 +62,8 @@ def recover(path: Path, out: Path) -> Recovery:
     times and numbers. Raises InputError (no log, ``out`` exists, disk full) and Refused (no complete message).
     """
     reader = LogReader(path)
-    if out.exists():
-        raise InputError("exists already", file=out, remedy="choose another --out, or move it away")
     try:
-        with completed_file(out) as temporary:
+        with completed_file(out, new=True) as temporary:
             return _copy(reader, temporary, out)
     except OSError as error:
         raise InputError(
