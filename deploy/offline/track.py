@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -169,11 +169,6 @@ def track_recording(
     if count <= start:
         what = f"the video ends after {count} frames, before --start {start}"
         raise InputError(what, remedy="give a smaller --start")
-
-
-def without_overlay_data(row: TrackedFrame) -> TrackedFrame:
-    """The estimate without particles and layers, which only overlays need."""
-    return replace(row, estimate=replace(row.estimate, particles=None, layers={}))
 
 
 def track_text(rows: Sequence[TrackedFrame]) -> str:

@@ -127,7 +127,7 @@ def track(
             progress=frame_done,
         ):
             # Particles and layers are only for the overlay, and would fill the memory for a long video.
-            rows.append(tracking.without_overlay_data(row))
+            rows.append(replace(row, estimate=replace(row.estimate, particles=None, layers={})))
         write_together(
             {
                 out / tracking.TRACK: tracking.track_text(rows),
