@@ -21,7 +21,7 @@ from edge.devices.settings import OakSettings, PiSettings
 from protocols.bus.base import Bus
 from protocols.core.errors import EXIT_DONE, InputError
 from protocols.geometry.camera import Intrinsics
-from protocols.session.rig import Rig, RigCamera, read_rig
+from protocols.session.rig import RigCamera, read_rig
 
 
 def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] = lambda: None) -> int:
@@ -33,7 +33,7 @@ def start_camera(config: CameraConfig, bus: Bus, stop: threading.Event, beat: Ca
     from edge.agents.camera import CameraAgent
 
     cv2.setNumThreads(1)  # one core a camera: several agents share a board
-    known = _known_camera(config)
+    known = known_camera(config.rig, config.id)
     device = make_device(config, None if known is None else known.intrinsics)
     if config.driver == "log":
         device.open()  # the lens and the rate are in the log
@@ -244,13 +244,11 @@ def _simulated(config: CameraConfig) -> Device:
     )
 
 
-def _known_camera(config: CameraConfig) -> RigCamera | None:
-    if config.rig is None:
+def known_camera(rig_file: Path | None, name: str) -> RigCamera | None:
+    """An agent's own camera in its rig file; None without a file. Raises InputError where it is not in it."""
+    if rig_file is None:
         return None
-    rig: Rig = read_rig(config.rig)
-    camera = rig.cameras.get(config.id)
-    if camera is None:
-        raise InputError(
-            f"no camera {config.id!r} ({', '.join(rig.cameras)})", file=config.rig, remedy=f"add [{config.id}] to it"
-        )
-    return camera
+    cameras = read_rig(rig_file).cameras
+    if name not in cameras:
+        raise InputError(f"no camera {name!r} ({', '.join(cameras)})", file=rig_file, remedy=f"add [{name}] to it")
+    return cameras[name]

@@ -22,18 +22,10 @@ def limit_heap_growth(*, release_large_blocks: bool) -> bool:
     fault for each 4 KiB of it: suitable for a process that solves every few seconds, not for one that handles 30
     images per second. Environment variables (MALLOC_ARENA_MAX, …) are overridden.
     """
-    try:
-        set_option = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):  # musl, macOS
-        return False
-    done = bool(set_option(_ARENA_MAX, _MAX_ARENAS))
+    options = {_ARENA_MAX: _MAX_ARENAS}
     if release_large_blocks:
-        done = (
-            bool(set_option(_MMAP_THRESHOLD, _LARGE_BLOCK_BYTES))
-            and bool(set_option(_TRIM_THRESHOLD, _LARGE_BLOCK_BYTES))
-            and done
-        )
-    return done
+        options |= {_MMAP_THRESHOLD: _LARGE_BLOCK_BYTES, _TRIM_THRESHOLD: _LARGE_BLOCK_BYTES}
+    return _set_options(options)
 
 
 def retain_freed_memory() -> bool:
@@ -44,10 +36,13 @@ def retain_freed_memory() -> bool:
     for reference cycles, of which imports and solvers make few, takes another thirtieth.
     """
     gc.set_threshold(_OBJECTS_PER_COLLECTION)
+    return _set_options({_MMAP_THRESHOLD: _MAX_MMAP_THRESHOLD_BYTES, _TRIM_THRESHOLD: _NEVER_TRIM_BYTES})
+
+
+def _set_options(options: dict[int, int]) -> bool:
     try:
         set_option = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # musl, macOS
         return False
-    return bool(set_option(_MMAP_THRESHOLD, _MAX_MMAP_THRESHOLD_BYTES)) and bool(
-        set_option(_TRIM_THRESHOLD, _NEVER_TRIM_BYTES)
-    )
+    done = [bool(set_option(option, value)) for option, value in options.items()]
+    return all(done)

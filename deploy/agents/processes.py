@@ -16,7 +16,7 @@ from typing import Any
 import tomli_w
 
 from deploy.agents.signals import Interruption
-from protocols.core.errors import InputError, Refused
+from protocols.core.errors import Refused
 from protocols.core.files import check_folder
 
 START_TIMEOUT_S, STOP_TIMEOUT_S = 60.0, 40.0
@@ -68,16 +68,13 @@ class AgentProcesses:
         self._interruption = interruption
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         check_folder(out)
-        try:
-            for name in ("config", "logs", *outputs):
-                if (out / name).is_dir():
-                    shutil.rmtree(out / name)
-                else:
-                    (out / name).unlink(missing_ok=True)
-            self._configs.mkdir(parents=True)
-            self.logs.mkdir()
-        except OSError as error:
-            raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
+        for name in ("config", "logs", *outputs):
+            if (out / name).is_dir():
+                shutil.rmtree(out / name)
+            else:
+                (out / name).unlink(missing_ok=True)
+        self._configs.mkdir(parents=True)
+        self.logs.mkdir()
 
     def start(self, name: str, role: str, table: Mapping[str, Any]) -> None:
         """Start an agent with a configuration file, as a user would."""

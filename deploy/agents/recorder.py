@@ -98,7 +98,7 @@ def run_recorder(
                     messages += _record(writer, bus.site, subscriptions, limiter)
                     if now >= next_sync:
                         writer.sync()
-                        retention.clean(writer.current)
+                        retention.clean(writer.path)
                         full = space.lack()
                 except InputError as error:  # a disk that is full all at once, or gone; the log is closed
                     full = error.what

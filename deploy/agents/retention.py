@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from deploy.config.agents import RecorderConfig
 from protocols.core.clocks import UNSET_CLOCK_UNIX_S
@@ -45,17 +45,12 @@ def _order(path: Path) -> tuple[str, int, int] | None:
 
 def free_bytes(folder: Path) -> int:
     """Free bytes on the disk of ``folder``, which need not exist yet."""
-    return _usage(folder).free
+    return int(_usage(folder).free)
 
 
-class _Disk(NamedTuple):
-    total: int
-    free: int
-
-
-def _usage(folder: Path) -> _Disk:
-    used = shutil.disk_usage(next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir()))
-    return _Disk(used.total, used.free)
+def _usage(folder: Path) -> Any:
+    """shutil's total and free bytes on the disk of a folder, which need not exist yet."""
+    return shutil.disk_usage(next(parent for parent in (folder, *folder.absolute().parents) if parent.is_dir()))
 
 
 class Space:

@@ -18,7 +18,6 @@ from protocols.core.errors import EXIT_DONE, InputError
 from protocols.core.version import VERSION
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
-from protocols.session.rig import read_rig
 
 if TYPE_CHECKING:
     from edge.devices.simulated.aircraft import SimulatedAircraft
@@ -76,7 +75,7 @@ def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable
             mounting,
             config.seed,
             config.model,
-            _quality(config),
+            None if config.images is None else config.images.quality,
             config.pictures_hz,
             config.picture_width,
         )
@@ -247,10 +246,13 @@ def _camera(config: UavConfig) -> Iterator[tuple[Device, Intrinsics | None, Floa
             )
             yield camera, simulated_flight.world.lens, gimbal_from_camera() if config.mount == "gimbal" else fixed
         return
-    from deploy.agents.assembly import make_device
+    from deploy.agents.assembly import known_camera, make_device
     from deploy.config.agents import CameraConfig
 
-    lens, mounting = _rig_camera(config)
+    known = known_camera(config.rig, config.id)
+    lens, mounting = (None, None) if known is None else (known.intrinsics, known.body_from_camera)
+    if mounting is None and config.mount == "gimbal":
+        mounting = gimbal_from_camera()
     settings = CameraConfig(id=config.id, driver=config.driver, video=config.video, oak=config.oak)
     yield make_device(settings, lens), lens, mounting
 
@@ -260,22 +262,3 @@ def gimbal_from_camera() -> Floats:
     from edge.devices.simulated.aircraft import GIMBAL_FROM_CAMERA
 
     return GIMBAL_FROM_CAMERA
-
-
-def _rig_camera(config: UavConfig) -> tuple[Intrinsics | None, Floats | None]:
-    if config.rig is None:
-        return None, gimbal_from_camera() if config.mount == "gimbal" else None
-    rig = read_rig(config.rig)
-    camera = rig.cameras.get(config.id)
-    if camera is None:
-        raise InputError(
-            f"no camera {config.id!r} ({', '.join(rig.cameras)})", file=config.rig, remedy=f"add [{config.id}] to it"
-        )
-    mounting = camera.body_from_camera
-    if mounting is None and config.mount == "gimbal":
-        mounting = gimbal_from_camera()
-    return camera.intrinsics, mounting
-
-
-def _quality(config: UavConfig) -> int | None:
-    return None if config.images is None else config.images.quality

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from deploy.config.uav import VideoOutConfig
+from protocols.core.jpeg import encode_jpeg
 
 if TYPE_CHECKING:
     from edge.mavlink.roles.camera_messages import VideoStream
@@ -40,13 +41,8 @@ class OperatorVideo:
 
     def jpeg(self, quality: int) -> bytes | None:
         """The rendered frame as JPEG."""
-        import cv2
-
         image = self.render()
-        if image is None:
-            return None
-        good, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        return data.tobytes() if good else None
+        return None if image is None else encode_jpeg(image, quality) or None
 
 
 def serve_video(

@@ -60,9 +60,6 @@ class AgentConfig(StrictConfig, frozen=True, kw_only=True, forbid_unknown_fields
         try:
             check_identifier(self.site, "site")
             check_name(getattr(self, "id", "ok"), "id")
-        except InputError as error:
-            raise ValueError(f"{error.what}; {error.remedy}") from None
-        try:
             self.bus.endpoints()
         except InputError as error:
             raise ValueError(f"{error.what}; {error.remedy}") from None

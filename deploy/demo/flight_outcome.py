@@ -165,9 +165,7 @@ def print_outcome(outcome: FlightOutcome, out: Path) -> None:
 
     from deploy.offline.outputs import wide_console
 
-    table = Table(title="estimated against true position of the car")
-    for name in ("", "estimated", "limit"):
-        table.add_column(name)
+    table = Table("", "estimated", "limit", title="estimated against true position of the car")
     for row in as_rows(outcome):
         table.add_row(*row)
     console = wide_console()

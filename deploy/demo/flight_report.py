@@ -16,6 +16,7 @@ from hub.report.page import html_page, section
 from hub.report.svg import at, drawing, esc, points, text
 from hub.report.tables import table
 from protocols.core.files import write_atomically
+from protocols.core.jpeg import encode_jpeg
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
@@ -79,7 +80,7 @@ def _map(states: Sequence[pb.TargetState], world: FlightWorld) -> str:
             dots = "".join(f'<circle cx="{at(x)}" cy="{at(y)}" r="2"/>' for x, y in zip(*xy(path), strict=True))
             parts.append(f'<g fill="{_COLOURS[state]}">{dots}</g>')
     height = 2.0 * _MARGIN_PX + scale * float(high[0] - low[0])
-    metres = _scale_bar_length(float((high - low).max()))
+    metres = float(10.0 ** np.floor(np.log10(max(0.4 * float((high - low).max()), 1.0))))
     parts.append(
         f'<path d="M{at(_MARGIN_PX)} {at(height - 8)}h{at(scale * metres)}" stroke="#1b2430" stroke-width="3"/>'
     )
@@ -87,10 +88,6 @@ def _map(states: Sequence[pb.TargetState], world: FlightWorld) -> str:
     lead = "Grey: true path. Green: estimated while the car was visible. Orange: estimated while it was out of view."
     label = "Map of the car's true path and of the agent's estimates"
     return f'<p class="lead">{lead}</p>{drawing(_MAP_PX[0], height, parts, label)}'
-
-
-def _scale_bar_length(span: float) -> float:
-    return float(10.0 ** np.floor(np.log10(max(0.4 * span, 1.0))))
 
 
 def _select_report_frames(states: Sequence[pb.TargetState], world: FlightWorld) -> list[_ReportFrame]:
@@ -137,8 +134,6 @@ def _pictures(log: Path, states: Sequence[pb.TargetState], world: FlightWorld) -
 
 
 def _figure(message: pb.FlightImage, state: Any, clouds: Iterable[pb.TargetCloud], why: str) -> str:
-    import cv2
-
     from edge.uav.base import Estimate, TrackState
     from edge.uav.estimator import decode_image
     from edge.uav.operator_view import draw
@@ -151,10 +146,7 @@ def _figure(message: pb.FlightImage, state: Any, clouds: Iterable[pb.TargetCloud
     width, height = state.size if state.size else (nan, nan)
     particles = next((np.array(cloud.pixels).reshape(-1, 2) for cloud in clouds), None)
     estimate = Estimate(0.0, TrackState(state.state), x, y, width, height, nan, state.std_px, particles=particles)
-    good, data = cv2.imencode(".jpg", draw(image, estimate, state.state), [cv2.IMWRITE_JPEG_QUALITY, 80])
-    if not good:
-        return ""
-    source = f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}"
+    source = f"data:image/jpeg;base64,{base64.b64encode(encode_jpeg(draw(image, estimate, state.state), 80)).decode()}"
     caption_text = f"{state.state}, {why}" if why != state.state else why
     caption = f"<figcaption><small>Frame {message.frame}: {esc(caption_text)}.</small></figcaption>"
     return f'<figure><img src="{source}" alt="{esc(caption_text)}">{caption}</figure>'

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from deploy.offline.csv_table import read_csv_table
 from deploy.offline.track import TrackedFrame
 from edge.uav.base import TrackState
 from protocols.core.errors import InputError
-from protocols.core.files import read_text
 from protocols.geometry.types import Bools, Floats
 
 NEAR_PX = 20.0  # of a track that is on its target
@@ -27,25 +25,11 @@ def read_truth(file: Path) -> dict[int, dict[str, float]]:
 
     inside: fraction of the target within the image; visible: fraction that is visible. Raises InputError.
     """
-    reader = csv.DictReader(io.StringIO(read_text(file, "truth file")))
-    missing = [name for name in ("frame", "x", "y") if name not in (reader.fieldnames or ())]
-    if missing:
-        remedy = "the first line must name frame,x,y[,width,height][,inside][,visible]"
-        raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
-    rows: dict[int, dict[str, float]] = {}
-    for row in reader:
-        values: dict[str, float] = {}
-        for name in ("frame", "x", "y", "width", "height", "inside", "visible"):
-            try:
-                values[name] = float(row.get(name) or "nan")
-            except ValueError:
-                what = f"{name} {row.get(name)!r} is not a number"
-                raise InputError(what, file=file, line=reader.line_num, remedy="correct this row") from None
-        if math.isfinite(values["frame"]):
-            rows[int(values["frame"])] = values
-    if not rows:
-        raise InputError("no rows", file=file, line=1, remedy="give the truth of at least one frame")
-    return rows
+    table = read_csv_table(file, "truth", ("frame", "x", "y"), ("width", "height", "inside", "visible"))
+    values = {name: table.numbers_or_gaps(name).tolist() for name in table.columns}
+    absent = dict.fromkeys(("width", "height", "inside", "visible"), math.nan)
+    rows = [absent | dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
+    return {int(row["frame"]): row for row in rows if math.isfinite(row["frame"])}
 
 
 def score(

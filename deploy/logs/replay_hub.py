@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
 from hub.live.scheduled_hub import ScheduledHub
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
+from protocols.core.files import completed_file
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.session.calibration import read_calibration
@@ -41,36 +41,29 @@ def replay_through_hub(
     time, after the same messages on every machine. ``out`` is written atomically. Raises InputError.
     """
     reader = LogReader(log)
-    if out.exists():
-        raise InputError("exists already", file=out, remedy="choose another --out, or move it away")
-    temporary = out.with_name(f".{out.name}.{os.getpid()}")
     known = None if calibration is None else KnownCalibration(*read_calibration(calibration))
     recorded = next(reader.messages([SOLVER_EVENT]), None) if known is None and settings is None else None
     hub = ScheduledHub() if recorded is not None else LiveHub(settings, known=known)
     count, first_ns, now_ns, site = 0, None, 0, ""
-    try:
-        with LogWriter(temporary, {"replay": {"through": "hub"}}) as writer:
+    with completed_file(out, new=True) as temporary, LogWriter(temporary, {"replay": {"through": "hub"}}) as writer:
 
-            def publish(final: bool = False) -> int:
-                published = hub.tick((now_ns - (first_ns or 0)) / NANOSECONDS, final=final)
-                for message in published:
-                    writer.write(_TOPICS[message.DESCRIPTOR.name], agent, site, message, now_ns)
-                smoothed = [] if hub.tracking is None else hub.tracking.smoothed()
-                for track in smoothed:
-                    writer.write(TRACK_SMOOTHED, agent, site, track, now_ns)
-                return len(published) + len(smoothed)
+        def publish(final: bool = False) -> int:
+            published = hub.tick((now_ns - (first_ns or 0)) / NANOSECONDS, final=final)
+            for message in published:
+                writer.write(_TOPICS[message.DESCRIPTOR.name], agent, site, message, now_ns)
+            smoothed = [] if hub.tracking is None else hub.tracking.smoothed()
+            for track in smoothed:
+                writer.write(TRACK_SMOOTHED, agent, site, track, now_ns)
+            return len(published) + len(smoothed)
 
-            for logged in reader.messages(_INPUTS if recorded is None else [*_INPUTS, SOLVER_EVENT]):
-                if logged.topic is SOLVER_EVENT and recorded is not None and logged.agent != recorded.agent:
-                    continue  # of another hub
-                first_ns = logged.log_time_ns if first_ns is None else first_ns
-                now_ns, site = max(now_ns, logged.log_time_ns), logged.site
-                hub.handle(logged.message)
-                count += publish()
-            if first_ns is None:
-                raise InputError("no observation in this log", file=log, remedy="record cameras that see what moves")
-            count += publish(final=True)
-        temporary.replace(out)
-    finally:
-        temporary.unlink(missing_ok=True)
+        for logged in reader.messages(_INPUTS if recorded is None else [*_INPUTS, SOLVER_EVENT]):
+            if logged.topic is SOLVER_EVENT and recorded is not None and logged.agent != recorded.agent:
+                continue  # of another hub
+            first_ns = logged.log_time_ns if first_ns is None else first_ns
+            now_ns, site = max(now_ns, logged.log_time_ns), logged.site
+            hub.handle(logged.message)
+            count += publish()
+        if first_ns is None:
+            raise InputError("no observation in this log", file=log, remedy="record cameras that see what moves")
+        count += publish(final=True)
     return count

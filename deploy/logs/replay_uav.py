@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.files import completed_file
 from protocols.geometry.camera import Intrinsics
 from protocols.log.read.reader import LogMessage, LogReader
 from protocols.log.write.writer import LogWriter
@@ -34,39 +34,30 @@ def replay_through_uav(log: Path, out: Path) -> tuple[int, int]:
 
     cv2.setNumThreads(1)
     reader = LogReader(log)
-    if out.exists():
-        raise InputError("exists already", file=out, remedy="choose another --out, or move it away")
     infos = _infos(reader)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}")
     estimators: dict[tuple[str, str], TargetEstimator] = {}
     next_order: dict[tuple[str, str], int] = {}
     count = missing = 0
-    try:
-        with LogWriter(temporary, {"replay": {"through": "uav"}}) as writer:
-            for logged in _in_order(reader):
-                message: Any = logged.message
-                name = (message.agent, message.boot_id)
-                info = infos.get(name)
-                if info is None:
-                    raise InputError(
-                        f"no uav_info of {message.agent}", file=log, remedy="record from the agent's start on"
-                    )
-                if name not in estimators:
-                    estimators[name] = _estimator(info)
-                    next_order[name] = 0
-                missing += message.order - next_order[name]
-                next_order[name] = message.order + 1
-                for output in estimators[name].handle(message):
-                    topic = _OUTPUTS[output.DESCRIPTOR.name]
-                    writer.write(topic, message.agent, logged.site, output, logged.log_time_ns)
-                    count += 1
-            if not estimators:
-                raise InputError(
-                    "no flight in this log", file=log, remedy="record a UAV agent with [images] in its configuration"
-                )
-        temporary.replace(out)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with completed_file(out, new=True) as temporary, LogWriter(temporary, {"replay": {"through": "uav"}}) as writer:
+        for logged in _in_order(reader):
+            message: Any = logged.message
+            name = (message.agent, message.boot_id)
+            info = infos.get(name)
+            if info is None:
+                raise InputError(f"no uav_info of {message.agent}", file=log, remedy="record from the agent's start on")
+            if name not in estimators:
+                estimators[name] = _estimator(info)
+                next_order[name] = 0
+            missing += message.order - next_order[name]
+            next_order[name] = message.order + 1
+            for output in estimators[name].handle(message):
+                topic = _OUTPUTS[output.DESCRIPTOR.name]
+                writer.write(topic, message.agent, logged.site, output, logged.log_time_ns)
+                count += 1
+        if not estimators:
+            raise InputError(
+                "no flight in this log", file=log, remedy="record a UAV agent with [images] in its configuration"
+            )
     return count, missing
 
 

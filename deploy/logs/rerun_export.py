@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from hub.view.player import Recording
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
-from protocols.core.files import check_folder
+from protocols.core.files import check_folder, completed_file
 from protocols.geometry import so3
 from protocols.log.write.thumbnails import ThumbnailScale, thumbnail_scale
 from protocols.messages import syncline_pb2 as pb
@@ -38,10 +37,9 @@ def write_rrd(recording: Recording, out: Path) -> int:
         raise InputError("a rerun recording is an .rrd file", file=out, remedy="name it so")
     check_folder(out.parent)
     out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.stem}.{os.getpid()}.rrd")
     stream = rr.RecordingStream("syncline")
     count = 0
-    try:
+    with completed_file(out) as temporary:
         stream.save(str(temporary))
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         # Static messages of a calibration folder are not in the list of messages; a log repeats them.
@@ -57,9 +55,6 @@ def write_rrd(recording: Recording, out: Path) -> int:
             count += _log(rr, stream, message, scales)
         stream.flush()
         stream.disconnect()
-        temporary.replace(out)
-    finally:
-        temporary.unlink(missing_ok=True)
     return count
 
 

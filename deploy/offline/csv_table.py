@@ -41,6 +41,14 @@ class CsvTable:
         )
         return values
 
+    def numbers_or_gaps(self, name: str) -> Floats:
+        """A column (n,) of numbers, NaN where a cell is empty. Raises InputError."""
+        cells = self.columns[name]
+        values = np.array([_number(cell or "nan") for cell in cells])
+        wrong = np.isnan(values) & [cell.lower().lstrip("+-") not in ("", "nan") for cell in cells]
+        self.refuse(wrong, lambda row: f"{cells[row]!r} is not a number", "give a number, or leave it empty")
+        return values
+
     def whole(self, name: str) -> Ints:
         """A column (n,) of whole numbers. Raises InputError."""
         values = self.numbers(name, _LARGEST_WHOLE)

@@ -46,9 +46,8 @@ def print_session(folder: Path, as_json: bool) -> None:
 
     from deploy.offline.outputs import wide_console
 
-    table = Table(title=f"{description['session']}: clocks {description['clock']}", title_justify="left")
-    for column in ("camera", "image", "fps", "lens", "rows", "labels", "from [s]", "to [s]"):
-        table.add_column(column)
+    columns = ("camera", "image", "fps", "lens", "rows", "labels", "from [s]", "to [s]")
+    table = Table(*columns, title=f"{description['session']}: clocks {description['clock']}", title_justify="left")
     for name, camera in description["cameras"].items():
         begin, end = camera["begin"], camera["end"]
         table.add_row(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -296,10 +296,8 @@ def times_text(video: SynchronisedVideo) -> str:
 def grid_text(grid: Floats, videos: dict[str, SynchronisedVideo], header: Callable[[str], str]) -> str:
     """CSV text with frame,reference_time,CAMERA,…: the source frame of each video in each output frame."""
     lines = [",".join(["frame", "reference_time", *(header(name) for name in videos)])]
-    lines += [",".join(row) for row in _grid_rows(grid, videos)]
-    return "\n".join(lines) + "\n"
-
-
-def _grid_rows(grid: Floats, videos: dict[str, SynchronisedVideo]) -> Iterator[list[str]]:
     for index, time in enumerate(grid):
-        yield [str(index), f"{time:.17g}", *(str(video.source_frames[index]) for video in videos.values())]
+        lines.append(
+            ",".join([str(index), f"{time:.17g}", *(str(one.source_frames[index]) for one in videos.values())])
+        )
+    return "\n".join(lines) + "\n"

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import cv2
 import numpy as np
 
+from deploy.offline.csv_table import read_csv_table
 from edge.devices.base import Frame
 from edge.devices.playback.video_file import image_files
 from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, Tracker, TrackState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
-from protocols.core.files import read_text
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from protocols.session.rig import RigCamera, read_rig
@@ -92,30 +90,14 @@ def read_telemetry(file: Path) -> TelemetryFile:
     if file.suffix.lower() in (".bin", ".ulg"):
         remedy = "give the .tlog, or export a telemetry.csv with time,qw,qx,qy,qz[,north,east,down]"
         raise InputError(f"{file.suffix} telemetry can't be read by this version", file=file, remedy=remedy)
-    reader = csv.reader(io.StringIO(read_text(file, "telemetry file")), strict=True)
-    try:
-        header = [cell.strip() for cell in next(reader, [])]
-        missing = [name for name in ("time", *_QUATERNION) if name not in header]
-        if missing:
-            remedy = "the first line must name time,qw,qx,qy,qz[,north,east,down]"
-            raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
-        placed = all(name in header for name in _POSITION)
-        wanted = [header.index(name) for name in ("time", *_QUATERNION, *(_POSITION if placed else ()))]
-        found: list[Floats] = []
-        left_out = 0
-        for row in reader:
-            if not any(cell.strip() for cell in row):
-                continue
-            values = _numbers(row, wanted, file, reader.line_num)
-            if np.isfinite(values[:5]).all() and 0.5 < np.linalg.norm(values[1:5]) < 2.0:
-                found.append(values)
-            else:
-                left_out += 1
-    except csv.Error as error:
-        raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
-    if not found:
+    cells = read_csv_table(file, "telemetry", ("time", *_QUATERNION), _POSITION)
+    position = _POSITION if cells.columns.keys() >= set(_POSITION) else ()
+    table = np.column_stack([cells.numbers_or_gaps(name) for name in ("time", *_QUATERNION, *position)])
+    length = np.linalg.norm(table[:, 1:5], axis=1)
+    usable = np.isfinite(table[:, :5]).all(axis=1) & (length > 0.5) & (length < 2.0)
+    if not usable.any():
         raise InputError("no usable row", file=file, line=1, remedy="record telemetry with attitude quaternions")
-    table = np.array(found)
+    left_out, table = int((~usable).sum()), table[usable]
     table = table[np.argsort(table[:, 0], kind="stable")]
     fresh = np.r_[True, np.diff(table[:, 0]) > 0]
     left_out += int((~fresh).sum())
@@ -126,22 +108,6 @@ def _sample(row: Floats) -> Telemetry:
     """A sample from a row with time, quaternion and, if present, position."""
     position = row[5:8].copy() if len(row) == 8 and np.isfinite(row[5:8]).all() else None
     return Telemetry(float(row[0]), so3.from_quaternion(row[1:5]), position)
-
-
-def _numbers(row: list[str], wanted: Sequence[int], file: Path, line: int) -> Floats:
-    """The selected cells of a row as numbers; empty cells are NaN."""
-    if len(row) <= max(wanted):
-        what = f"{len(row)} cells where {max(wanted) + 1} are needed"
-        raise InputError(what, file=file, line=line, remedy="correct this row")
-    values = []
-    for index in wanted:
-        cell = row[index].strip()
-        try:
-            values.append(float(cell) if cell else math.nan)
-        except ValueError:
-            remedy = "give a number, or leave it empty"
-            raise InputError(f"{cell!r} is not a number", file=file, line=line, remedy=remedy) from None
-    return np.array(values, dtype=np.float64)
 
 
 def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) -> None:
@@ -169,7 +135,7 @@ def track_recording(
     *,
     start: int = 0,
     telemetry: Sequence[Telemetry] = (),
-    show: Callable[[Image, TrackedFrame], None] | None = None,
+    show: Callable[[Image, TrackedFrame], object] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[TrackedFrame]:
     """Run a tracker over an opened recording, from frame ``start`` on.
@@ -203,11 +169,6 @@ def track_recording(
     if count <= start:
         what = f"the video ends after {count} frames, before --start {start}"
         raise InputError(what, remedy="give a smaller --start")
-
-
-def without_overlay_data(row: TrackedFrame) -> TrackedFrame:
-    """The estimate without particles and layers, which only overlays need."""
-    return replace(row, estimate=replace(row.estimate, particles=None, layers={}))
 
 
 def track_text(rows: Sequence[TrackedFrame]) -> str:

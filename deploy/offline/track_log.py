@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +27,8 @@ _FPS = 30.0  # where the log does not tell
 class LoggedFlightImages:
     """Images of the agent and boot with the most images. lens, body_from_camera: as known to that agent.
 
-    count: images in the log. repaired: images that cannot be decoded, or whose time does not increase.
+    count: images in the log. repaired: images that cannot be decoded, or whose time does not increase. first_s: camera
+    time of the first image [s]. Raises InputError if the log has no image that can be decoded.
     """
 
     def __init__(self, log: Path, *, fps: float | None = None, intrinsics: Intrinsics | None = None) -> None:
@@ -44,54 +46,26 @@ class LoggedFlightImages:
             if _name(message) == self._chosen:
                 self._info = message
                 break
-        self._given_fps = fps
-        self.lens = intrinsics or _lens(self._info)
+        self.lens = intrinsics or (None if self._info is None else Intrinsics.of_message(self._info))
         self.body_from_camera = _mounting(self._info)
-        self._frames: Iterator[Frame] | None = None
-        self._first: Frame | None = None
-        self._pending: Frame | None = None
         self.repaired = 0
-
-    @property
-    def info(self) -> DeviceInfo:
-        """Device information, with the size of the first image."""
-        if self._first is None:
-            raise RuntimeError("open the log first")
-        height, width = self._first.image.shape[:2]
-        known = self._info.fps if self._info is not None and self._info.fps > 0.0 else _FPS
-        return DeviceInfo(width, height, self._given_fps or known, "log", "stream", self.lens, unknown=("exposure",))
-
-    @property
-    def ended(self) -> bool:
-        """True after the last image."""
-        return self._frames is None
-
-    @property
-    def first_s(self) -> float:
-        """Camera time of the first image [s]."""
-        return 0.0 if self._first is None else self._first.device_time_ns / NANOSECONDS
-
-    def open(self) -> None:
-        """Start reading at the first image. Raises InputError if none can be decoded."""
-        self._frames = self._read()
-        self._first = next(self._frames, None)
-        if self._first is None:
+        frames = self._read()
+        first = next(frames, None)
+        if first is None:
             raise InputError("no image of this log can be decoded", remedy="give the video itself")
-        self._pending = self._first
+        self._frames: Iterator[Frame] = itertools.chain((first,), frames)
+        self.first_s = first.device_time_ns / NANOSECONDS
+        height, width = first.image.shape[:2]
+        rate = fps or (self._info.fps if self._info is not None and self._info.fps > 0.0 else _FPS)
+        self.info = DeviceInfo(width, height, rate, "log", "stream", self.lens, unknown=("exposure",))
 
     def read(self, timeout_s: float) -> Frame | None:
         """The next image; None after the last."""
-        if self._pending is not None:
-            frame, self._pending = self._pending, None
-            return frame
-        following = None if self._frames is None else next(self._frames, None)
-        if following is None:
-            self._frames = None
-        return following
+        return next(self._frames, None)
 
     def close(self) -> None:
         """May be called twice."""
-        self._frames = None
+        self._frames = iter(())
 
     def _read(self) -> Iterator[Frame]:
         newest = -1
@@ -117,19 +91,11 @@ def open_recording(
         recording.open()
         return recording, None
     logged = LoggedFlightImages(video, fps=fps, intrinsics=intrinsics)
-    logged.open()
     return logged, logged.count
 
 
 def _name(message: Any) -> tuple[str, str]:
     return message.agent, message.boot_id
-
-
-def _lens(info: pb.UavInfo | None) -> Intrinsics | None:
-    if info is None or not info.matrix:
-        return None
-    distortions = np.array(info.distortions) if info.distortions else np.zeros(5)
-    return Intrinsics(info.width, info.height, np.array(info.matrix).reshape(3, 3), distortions, info.fisheye)
 
 
 def _mounting(info: pb.UavInfo | None) -> Floats | None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 
 from deploy.offline.track import TrackedFrame
 from edge.uav.base import Image, TrackState
-from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
 _MARGIN = 0.5  # fraction of the image size added on each side
@@ -18,44 +15,6 @@ _COLOURS = {TrackState.VISIBLE: (80, 220, 80), TrackState.COASTING: (40, 170, 25
 _LAYERS = {"road": (110, 80, 30), "tracks": (160, 160, 160)}
 _OTHER_LAYER = (0, 220, 220)  # BGR
 _PARTICLE = (230, 120, 230)  # BGR
-
-
-class Overlay:
-    """Writes the video to a temporary file that is renamed to ``file`` when complete. Use as a context manager."""
-
-    def __init__(self, file: Path, fps: float) -> None:
-        self._file, self._fps = file, fps
-        self._part = file.with_name(f".{file.stem}.part{file.suffix}")
-        self._writer: cv2.VideoWriter | None = None
-        self._done = False
-
-    def __enter__(self) -> Overlay:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._writer is not None:
-            self._writer.release()
-        if not self._done:
-            self._part.unlink(missing_ok=True)
-
-    def show(self, image: Image, tracked: TrackedFrame) -> None:
-        """Add one frame. Raises InputError if no video can be written."""
-        canvas = draw(image, tracked)
-        if self._writer is None:
-            self._file.parent.mkdir(parents=True, exist_ok=True)
-            size = (canvas.shape[1], canvas.shape[0])
-            self._writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*"mp4v"), self._fps, size)
-            if not self._writer.isOpened():
-                raise InputError("no video can be written here", file=self._file, remedy="leave out --overlay")
-        self._writer.write(canvas)
-
-    def finish(self) -> None:
-        """Close the video and rename it to its final name."""
-        if self._writer is not None:
-            self._writer.release()
-            self._writer = None
-            self._part.replace(self._file)
-        self._done = True
 
 
 def draw(image: Image, tracked: TrackedFrame) -> Image:

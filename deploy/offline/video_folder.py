@@ -28,7 +28,7 @@ from edge.detectors.board.detector import BoardDetector
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.detectors.plugins import detector_revision, load_detector
-from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav
+from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav, is_video
 from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector
 from edge.offline.sound import ENERGY_RATE, sound_energy
 from edge.offline.video import MARKER_FILE, read_marker_model
@@ -203,11 +203,7 @@ def _unseen(board: Board | None) -> Refused | None:
 
 
 def _video_paths(folder: Path) -> list[Path]:
-    return sorted(
-        path
-        for path in folder.iterdir()
-        if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
-    )
+    return sorted(path for path in folder.iterdir() if path.is_file() and is_video(path))
 
 
 def _digest(path: Path) -> str:

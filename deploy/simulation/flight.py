@@ -5,15 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import tomli_w
 
+from edge.devices.playback.video_writer import video_writer
 from edge.uav.base import Telemetry
 from edge.uav.world import scenarios
 from edge.uav.world.flight_world import FlightWorld
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
+from protocols.core.jpeg import encode_jpeg
 from protocols.geometry import so3
 from protocols.session.folder import RIG_FILE
 
@@ -21,7 +22,6 @@ TOWN = "town"
 VIDEO_FILE, FRAMES_FOLDER, TELEMETRY_FILE, TRUTH_FILE = "video.mp4", "frames", "telemetry.csv", "truth.csv"
 _USUAL = "exit-bend"
 _CAMERA = "drone"
-_CODEC = "mp4v"  # MPEG-4 part 2: in every build of OpenCV with FFmpeg
 _JPEG_QUALITY = 95  # as good cameras write
 
 
@@ -33,11 +33,8 @@ def write_simulated_flight(
     scene: ``town`` or ``town:scenario``. frames: number out of view. rate_hz: of the telemetry. Raises InputError.
     """
     world = scenarios.get(scene.partition(":")[2] or _USUAL, seed, size, frames)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        video = _write_video(world, out)
-    except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", file=out, remedy="choose another --out") from None
+    out.mkdir(parents=True, exist_ok=True)
+    video = _write_video(world, out)
     samples = world.telemetry(rate_hz, time_offset=None)
     write_together(
         {
@@ -60,20 +57,17 @@ def write_simulated_flight(
 
 def _write_video(world: FlightWorld, out: Path) -> Path:
     """Write the video or, if OpenCV cannot encode one, a folder of JPEGs."""
-    partial = out / f".partial.{VIDEO_FILE}"
-    writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*_CODEC), world.fps, world.size)
-    if writer.isOpened():
-        for i in range(world.length):
-            writer.write(world.frame(i))
-        writer.release()
-        partial.replace(out / VIDEO_FILE)
+    try:
+        with video_writer(out / VIDEO_FILE, world.fps, "") as write:
+            for i in range(world.length):
+                write(world.frame(i))
         return out / VIDEO_FILE
-    partial.unlink(missing_ok=True)
+    except InputError:
+        pass
     folder = out / FRAMES_FOLDER
     folder.mkdir(exist_ok=True)
     for i in range(world.length):
-        _, data = cv2.imencode(".jpg", world.frame(i), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-        (folder / f"{i:06d}.jpg").write_bytes(data.tobytes())
+        (folder / f"{i:06d}.jpg").write_bytes(encode_jpeg(world.frame(i), _JPEG_QUALITY))
     return folder
 
 

@@ -108,23 +108,13 @@ def _write_truth_boxes(file: Path, scene: PeopleScene, tracks: dict[str, PeopleT
 
 def _write_video(out: Path, scene: PeopleScene, name: str, track: PeopleTrack, seed: int) -> str:
     """Render the camera's frames into a video of constant frame rate; a lost frame repeats the one before it."""
-    import cv2
+    from edge.devices.playback.video_writer import video_writer
 
-    camera = scene.camera(name)
     renderer = renderer_for(scene, name, np.random.default_rng([seed, 9]))
-    file = out / f"{name}.mp4"
-    part = out / f".{name}.part.mp4"
-    size = camera.intrinsics.width, camera.intrinsics.height
-    writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), camera.fps, size)
-    if not writer.isOpened():
-        raise InputError("this OpenCV cannot write videos", file=file, remedy="leave out --render")
     frames, first = np.unique(track.frame, return_index=True)
-    try:
+    with video_writer(out / f"{name}.mp4", scene.camera(name).fps, "leave out --render") as write:
         for moment, repeats in zip(track.true_time[first], np.diff(frames, append=frames[-1] + 1), strict=True):
             image = renderer.render(float(moment))
             for _ in range(int(repeats)):
-                writer.write(image)
-    finally:
-        writer.release()
-    part.replace(file)
-    return str(file)
+                write(image)
+    return str(out / f"{name}.mp4")

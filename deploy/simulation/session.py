@@ -57,10 +57,7 @@ def write_scene(
 
     metadata: more for these. Raises InputError.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
+    out.mkdir(parents=True, exist_ok=True)
     rig, truth = camera_tables(scene, name)
     truth["metadata"].update(metadata or {})
     write_rig(out / RIG_FILE, rig)

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from protocols.core.errors import InputError, Refused
+from protocols.core.files import check_folder
 from protocols.core.version import VERSION
 
 if TYPE_CHECKING:
@@ -156,13 +157,10 @@ def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = ()
 
 def _clean(out: Path) -> None:
     """Create the folder, and remove only the wheels of an earlier bundle."""
-    try:
-        if (out / _WHEELS).is_dir():
-            for file in (out / _WHEELS).glob("*.whl"):
-                file.unlink()
-        (out / _WHEELS).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made: {error.strerror}", file=out, remedy="choose another --out") from None
+    check_folder(out)
+    (out / _WHEELS).mkdir(parents=True, exist_ok=True)
+    for file in (out / _WHEELS).glob("*.whl"):
+        file.unlink()
 
 
 def _requirements(role: str, target: Target, extras: Iterable[str]) -> Iterable[Requirement]:

@@ -21,6 +21,7 @@ from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, is_loopback
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.errors import InputError, Refused
+from protocols.core.files import check_folder, completed_file
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CALIBRATION, STATUS
 
@@ -169,9 +170,9 @@ class Fleet:
                 self._restart_at[name] = now + pause
                 seen = self.seen[name]
                 seen.pid, seen.state, seen.message = 0, "down", last_line(self._log(name))
-                self._report(
-                    f"{name} ended ({_exit_description(process.returncode)}): {seen.message}; again in {pause:g} s"
-                )
+                code = process.returncode
+                how = f"status {code}" if code >= 0 else signal.Signals(-code).name
+                self._report(f"{name} ended ({how}): {seen.message}; again in {pause:g} s")
 
     def _stop(self, agents: tuple[Agent, ...], show: Callable[[Fleet], None]) -> None:
         """Stop cameras first, so that hubs and recorders receive everything; then these, and the router last."""
@@ -221,12 +222,8 @@ class Fleet:
 
     def _prepare_folder(self) -> None:
         """Create the folder; refuse if a fleet is running in it, and stop processes orphaned by a killed one."""
-        try:
-            self.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"cannot be made: {error.strerror}", file=self.out, remedy="choose another --out"
-            ) from None
+        check_folder(self.out)
+        self.out.mkdir(parents=True, exist_ok=True)
         state = read_state(self.out)
         if state is None:
             return
@@ -246,9 +243,8 @@ class Fleet:
             "agents": {name: asdict(seen) for name, seen in self.seen.items()},
             "calibrations": self.calibrations,
         }
-        beside = self.out / f".{STATE}.new"
-        beside.write_text(json.dumps(state, indent=1), encoding="utf-8")
-        beside.replace(self.out / STATE)
+        with completed_file(self.out / STATE) as part:
+            part.write_text(json.dumps(state, indent=1), encoding="utf-8")
 
     def _log(self, name: str) -> Path:
         return self.out / "logs" / f"{name}.txt"
@@ -314,7 +310,3 @@ def stop_orphaned_agents(state: dict[str, Any]) -> list[str]:
                     os.kill(seen["pid"], signal.SIGKILL)
                 ended.append(name)
     return ended
-
-
-def _exit_description(status: int) -> str:
-    return f"status {status}" if status >= 0 else signal.Signals(-status).name

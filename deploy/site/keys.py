@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import ipaddress
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -26,7 +25,7 @@ import tomli_w
 from protocols.bus.security.access import access_rules, certificate_name, tls_settings
 from protocols.bus.settings import BusConfig, TlsConfig
 from protocols.core.errors import InputError
-from protocols.core.files import write_atomically
+from protocols.core.files import write_atomically, write_private
 from protocols.core.names import check_identifier
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ def make_site(folder: Path, site: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     folder.chmod(0o700)
     key = ec.generate_private_key(ec.SECP256R1())
-    name = _name(f"syncline {site}"[:64])
+    name = subject_name(f"syncline {site}"[:64])
     now = datetime.now(UTC)
     usage = x509.KeyUsage(False, False, False, False, False, True, True, False, False)
     certificate = (
@@ -302,7 +301,7 @@ def sign(
     names: list[x509.GeneralName] = [_general_name(host) for host in hosts]
     usage = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
     builder = (
-        _builder(_name(name), authority.subject, public, begin, end)
+        _builder(subject_name(name), authority.subject, public, begin, end)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage(usage), critical=False)
     )
@@ -359,7 +358,8 @@ def _builder(
     )
 
 
-def _name(text: str) -> x509.Name:
+def subject_name(text: str) -> x509.Name:
+    """The subject of a certificate: a common name."""
     from cryptography import x509
     from cryptography.x509.oid import NameOID
 
@@ -379,13 +379,7 @@ def write_key(file: Path, key: ec.EllipticCurvePrivateKey) -> None:
     text = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    temporary = file.with_suffix(".tmp")
-    temporary.unlink(missing_ok=True)
-    with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as out:
-        out.write(text)
-        out.flush()
-        os.fsync(out.fileno())
-    temporary.replace(file)
+    write_private(file, text)
 
 
 def need_cryptography() -> None:

@@ -170,7 +170,8 @@ class CameraAgent:
         seen: Sequence[Detection] | None = frame.detections
         if seen is None:
             seen = self._detector.detect(frame.image, frame.device_time_ns / NANOSECONDS, expected)
-        found = [detection for detection in seen if _is_finite(detection)]
+        # Validation on the bus would reject the whole frame otherwise.
+        found = [one for one in seen if all(map(math.isfinite, (one.u, one.v, one.size)))]
         self.detections += len(found)
         self.empty += not found
         message = pb.Observation(
@@ -267,11 +268,6 @@ def add_rig_pose(message: pb.CameraInfo, known: RigCamera) -> None:
         from protocols.geometry import so3
 
         message.rotation.extend(so3.log(known.rotation).tolist())
-
-
-def _is_finite(detection: Detection) -> bool:
-    """Whether all coordinates are finite: validation on the bus would reject the whole frame otherwise."""
-    return math.isfinite(detection.u) and math.isfinite(detection.v) and math.isfinite(detection.size)
 
 
 def detection_message(detection: Detection) -> pb.Detection:

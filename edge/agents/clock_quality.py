@@ -18,7 +18,6 @@ from pathlib import Path
 
 CommandRunner = Callable[[Sequence[str]], tuple[int, str]]
 _STA_UNSYNC = 0x0040  # adjtimex(2): the kernel's clock is not synchronised
-_COMMAND_TIMEOUT_S = 2.0  # chronyc answers in milliseconds, or hangs
 _PERIOD_S = 30.0  # between two queries: time services poll every minute or so
 _CHRONY_FIELDS = 14  # of `chronyc -c tracking`
 
@@ -42,6 +41,15 @@ class ClockQuality:
         return found
 
 
+def run_command(command: Sequence[str], timeout_s: float = 2.0) -> tuple[int, str]:
+    """(exit status, output) of a command, which answers in milliseconds, or hangs; status 127 if it does not exist."""
+    try:
+        result = subprocess.run(list(command), capture_output=True, text=True, timeout=timeout_s, check=False)
+    except (OSError, subprocess.TimeoutExpired, UnicodeDecodeError):
+        return 127, ""
+    return result.returncode, result.stdout
+
+
 def query_clock_quality(
     run: CommandRunner | None = None,
     kernel: Callable[[], tuple[bool, float]] | None = None,
@@ -51,7 +59,7 @@ def query_clock_quality(
 
     run: gives (exit status, output) of a command. kernel: gives (synchronised, error bound [s]). root: parent of /dev.
     """
-    query = run or _run_command
+    query = run or run_command
     status, text = query(("chronyc", "-c", "tracking"))
     if status == 0 and (error := chrony_error(text)) is not None:
         return ClockQuality("chrony", error)
@@ -148,11 +156,3 @@ class ClockMonitor:
             self.quality = self._query()
             if self._stop.wait(self._period_s):
                 return
-
-
-def _run_command(command: Sequence[str]) -> tuple[int, str]:
-    try:
-        result = subprocess.run(list(command), capture_output=True, text=True, timeout=_COMMAND_TIMEOUT_S, check=False)
-    except (OSError, subprocess.TimeoutExpired, UnicodeDecodeError):
-        return 127, ""
-    return result.returncode, result.stdout

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 
 from edge.devices.base import Frame
+from protocols.core.jpeg import encode_jpeg
 from protocols.messages import syncline_pb2 as pb
 from protocols.validation.codec import SCHEMA_VERSION
 
@@ -22,7 +23,6 @@ def thumbnail_message(frame: Frame, camera: str, boot_id: str, width: int = THUM
         step = max(1, full // (2 * width))
         size = (width, max(1, round(height * width / full)))
         image = cv2.resize(image[::step, ::step], size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    ok, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return pb.Picture(
         schema_version=SCHEMA_VERSION,
         camera=camera,
@@ -31,5 +31,5 @@ def thumbnail_message(frame: Frame, camera: str, boot_id: str, width: int = THUM
         device_time_ns=frame.device_time_ns,
         width=full,
         height=height,
-        jpeg=jpeg.tobytes() if ok else b"",
+        jpeg=encode_jpeg(image, _JPEG_QUALITY),
     )

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 from google.protobuf.message import Message
 
@@ -32,6 +31,7 @@ from edge.uav.estimator import TargetEstimator, decode_image
 from edge.uav.timing.clock_alignment import CameraHostClock, ClockAligner
 from protocols.bus.base import Bus
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.jpeg import encode_jpeg
 from protocols.core.version import VERSION
 from protocols.geometry import so3
 from protocols.messages import syncline_pb2 as pb
@@ -307,7 +307,6 @@ class UavAgent:
         image: Image | None = frame.image
         quality = self._settings.jpeg_quality
         if quality is not None:
-            _, data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, quality])
             height, width = frame.image.shape[:2]
             message = pb.FlightImage(
                 **self._message_header(),
@@ -315,7 +314,7 @@ class UavAgent:
                 device_time_ns=frame.device_time_ns,
                 width=width,
                 height=height,
-                jpeg=data.tobytes(),
+                jpeg=encode_jpeg(frame.image, quality),
             )
             self._publish(message)
             image = decode_image(message)

@@ -11,23 +11,16 @@ import numpy as np
 from edge.detectors.base import Detection
 from edge.devices.base import Image
 from edge.devices.playback.video_reader import VideoReader
-from protocols.core.errors import InputError
+from edge.devices.playback.video_writer import video_writer
 
 _HUES = 12  # that the eye can tell apart
 
 
 def write_overlay(video: VideoReader, out: Path, found: Mapping[int, Sequence[tuple[str, Detection]]]) -> None:
     """Write ``out`` with boxes, heads (white), feet (black), representative points and labels. Raises InputError."""
-    part = out.with_name(f".{out.stem}.part{out.suffix or '.mp4'}")
-    writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), video.info.fps, video.info.size)
-    if not writer.isOpened():
-        raise InputError("this video cannot be written", file=out, remedy="give --overlay a name that ends in .mp4")
-    try:
+    with video_writer(out, video.info.fps, "give --overlay a name that ends in .mp4") as write:
         for frame in video:
-            writer.write(draw_detections(frame.image(), found.get(frame.frame, ())))
-    finally:
-        writer.release()
-    part.replace(out)
+            write(draw_detections(frame.image(), found.get(frame.frame, ())))
 
 
 def draw_detections(image: Image, found: Sequence[tuple[str, Detection]]) -> Image:

@@ -112,12 +112,9 @@ class Tracker(Protocol):
 
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
-        ...
 
     def handle_telemetry(self, sample: Telemetry) -> None:
         """Add one sample; the offset between its clock and the camera's is unknown (up to ±0.5 s)."""
-        ...
 
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
         """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
-        ...

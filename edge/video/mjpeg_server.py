@@ -89,7 +89,7 @@ class MjpegServer:
         self._new_frame = threading.Condition()
         self._number = 0
         self._closed = False
-        self._viewers = 0
+        self.viewers = 0
         self._compress = compress
         self._jpeg: tuple[int, bytes | None] = (-1, None)
         try:
@@ -106,11 +106,6 @@ class MjpegServer:
     def port(self) -> int:
         """The listening port."""
         return int(self._server.server_address[1])
-
-    @property
-    def viewers(self) -> int:
-        """Number of present viewers."""
-        return self._viewers
 
     def notify_frame(self) -> None:
         """Notify the viewers of a new image."""
@@ -175,8 +170,8 @@ class MjpegServer:
 
             def _stream(self) -> None:
                 with server._new_frame:
-                    full = server._viewers >= _MAX_VIEWERS
-                    server._viewers += not full
+                    full = server.viewers >= _MAX_VIEWERS
+                    server.viewers += not full
                 if full:
                     self.send_error(503, f"{_MAX_VIEWERS} viewers are the limit")
                     return
@@ -195,7 +190,7 @@ class MjpegServer:
                         self.wfile.write(head.encode() + data + b"\r\n")
                 finally:
                     with server._new_frame:
-                        server._viewers -= 1
+                        server.viewers -= 1
 
             def log_message(self, format: str, *args: object) -> None:
                 pass

@@ -30,7 +30,7 @@ from protocols.core.errors import InputError, Refused
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
-from protocols.session.calibration import Calibration, CameraCalibration
+from protocols.session.calibration import Calibration, CameraCalibration, stated_calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -564,14 +564,7 @@ class LiveHub:
     def _use_known(self, known: KnownCalibration) -> None:
         """Use the given calibration as this hub's result."""
         rig = known.rig
-        self.calibration = Calibration(
-            known.cameras,
-            str(rig.metadata.get("reference", next(iter(known.cameras), ""))),
-            str(rig.metadata.get("scale", "metric")),
-            rig.units,
-            "known",
-            VERSION,
-        )
+        self.calibration = replace(stated_calibration(rig, known.cameras), solver="known", version=VERSION, refused={})
         self._rig = rig
         self._track_with(self.calibration, rig, {})
 

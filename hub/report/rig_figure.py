@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 from collections.abc import Sequence
@@ -120,7 +121,7 @@ def rig_figure_script(figure: RigFigure) -> str:
             centres,
             "markers+text",
             "cameras",
-            text=[f"<b>{_markup(name)}</b>" for name in names],
+            text=[f"<b>{html.escape(name, quote=False)}</b>" for name in names],
             textposition="bottom center",
             textfont={"color": _NAVY, "size": 14},
             marker={"color": _NAVY, "size": 4},
@@ -195,10 +196,6 @@ def _round(value: float) -> float:
     return float(f"{value:.5g}") + 0.0
 
 
-def _markup(name: str) -> str:
-    return name.replace("&", "&amp;").replace("<", "&lt;")
-
-
 def _script_safe(value: Any) -> str:
     """JSON that is safe inside a <script> element."""
     return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
@@ -206,30 +203,18 @@ def _script_safe(value: Any) -> str:
 
 def plan_and_side(figure: RigFigure) -> str:
     """Plan and side view to scale as SVG, for printing and without scripts."""
+    views = [_view(figure, 0, 1, "From above"), _view(figure, 0, 2, "From the side")]
+    return f'<div class="views">{"".join(views)}</div>'
+
+
+def _view(figure: RigFigure, first: int, second: int, title: str) -> str:
     everything = np.concatenate([*figure.cameras.values(), *figure.paths])
     low, high = everything.min(axis=0), everything.max(axis=0)
     width, pad = 490.0, 46.0
     span = np.maximum(high - low, 1e-9)
     across = max(float(span[0]), 0.3 * float(span.max()))
     scale = min((width - 2 * pad) / across, 380.0 / float(span.max()))
-    views = []
-    for first, second, title in ((0, 1, "From above"), (0, 2, "From the side")):
-        height = max(float(span[second]) * scale, 60.0) + 2 * pad + 16
-        views.append(_view(figure, first, second, low, high, scale, width, height, title))
-    return f'<div class="views">{"".join(views)}</div>'
-
-
-def _view(
-    figure: RigFigure,
-    first: int,
-    second: int,
-    low: Floats,
-    high: Floats,
-    scale: float,
-    width: float,
-    height: float,
-    title: str,
-) -> str:
+    height = max(float(span[second]) * scale, 60.0) + 2 * pad + 16
     middle = 0.5 * (low + high)
 
     def place(rows: Floats) -> tuple[Floats, Floats]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -278,8 +277,3 @@ def draw_detections(image: Any, camera: CameraView) -> Any:
         for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
             cv2.circle(out, centre, radius, colour, width, cv2.LINE_AA)
     return out
-
-
-def new_id() -> str:
-    """A random id for this view: several views may be open on one site."""
-    return f"view-{secrets.token_hex(3)}"

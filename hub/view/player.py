@@ -17,7 +17,7 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.calibration import Calibration, read_calibration
+from protocols.session.calibration import Calibration, read_calibration, stated_calibration
 from protocols.session.trajectory import read_trajectory
 from protocols.topics import (
     CALIBRATION,
@@ -109,18 +109,7 @@ class CalibrationRecording:
     def __init__(self, folder: Path) -> None:
         file = folder / "calibration.toml" if folder.is_dir() else folder
         rig, cameras = read_calibration(file)
-        metadata = rig.metadata
-        reference = str(metadata.get("reference") or next(iter(cameras), ""))
-        refused = metadata.get("refused")
-        calibration = Calibration(
-            cameras,
-            reference,
-            str(metadata.get("scale", "arbitrary")),
-            rig.units,
-            str(metadata.get("solver", "")),
-            str(metadata.get("version", "")),
-            {str(name): str(why) for name, why in refused.items()} if isinstance(refused, dict) else {},
-        )
+        calibration = stated_calibration(rig, cameras)
         path = file.parent / "trajectory.csv"
         tables = read_trajectory(path) if path.exists() else ()
         self._messages: list[Timed] = [(0.0, _info(calibration, name)) for name in cameras]

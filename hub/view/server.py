@@ -15,7 +15,7 @@ from collections.abc import Callable
 import viser
 
 from hub.view.access_control import AccessControl, is_local
-from hub.view.page import ACTIONS, ViewPage, new_id
+from hub.view.page import ACTIONS, ViewPage
 from hub.view.player import Player, Recording
 from hub.view.scene_renderer import DisplayOptions, SceneRenderer
 from hub.view.state import ViewState
@@ -107,7 +107,7 @@ def run_view(
     """Show the bus until ``stop`` is set; send clicked actions as commands. each: called in every cycle, about 10 times
     a second, and up to 30 while a browser is open."""
     state = ViewState()
-    name, boot = new_id(), uuid.uuid4().hex
+    name, boot = f"view-{secrets.token_hex(3)}", uuid.uuid4().hex  # several views may be open on one site
     topics = (CAMERA_INFO, OBSERVATION, CALIBRATION, TRACK, STATUS, UAV_INFO, TARGET, TARGET_CLOUD, ROAD_MAP)
     subscriptions = [bus.subscribe(topic) for topic in topics]
     commands = bus.publisher(COMMAND, name)

@@ -11,7 +11,8 @@ import re
 import stat
 import tempfile
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +157,33 @@ def write_together(files: Mapping[Path, str]) -> None:
     finally:
         for temporary, _ in prepared:
             temporary.unlink(missing_ok=True)
+
+
+def write_private(file: Path, content: bytes, mode: int = 0o600) -> None:
+    """Write ``file`` atomically, at no time readable by others than its ``mode`` names."""
+    with completed_file(file) as part:
+        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as out:
+            out.write(content)
+            out.flush()
+            os.fsync(out.fileno())
+        part.chmod(mode)
+
+
+@contextmanager
+def completed_file(file: Path, *, new: bool = False) -> Iterator[Path]:
+    """A path beside ``file`` to write to, of the same suffix; it replaces ``file`` at the end, unless that failed.
+
+    new: whether to raise InputError where ``file`` exists.
+    """
+    if new and file.exists():
+        raise InputError("exists already", file=file, remedy="choose another --out, or move it away")
+    temporary = file.with_name(f".{file.stem}.{os.getpid()}{file.suffix}")
+    temporary.unlink(missing_ok=True)
+    try:
+        yield temporary
+        temporary.replace(file)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def file_in(folder: Path, name: str) -> Path:

@@ -1,4 +1,4 @@
-"""JPEG images that others send: their size from the header, and decoding within a bound."""
+"""JPEG images: encoding, and of those that others send the size from the header and decoding within a bound."""
 
 from __future__ import annotations
 
@@ -34,6 +34,14 @@ def jpeg_fits(data: bytes) -> bool:
     """Whether it is a JPEG of at most ``MAX_JPEG_PIXELS``."""
     size = jpeg_size(data)
     return size is not None and size[0] * size[1] <= MAX_JPEG_PIXELS
+
+
+def encode_jpeg(image: npt.NDArray[np.uint8], quality: int) -> bytes:
+    """An image (h, w, 3) BGR, or (h, w) grey, as JPEG of quality 0..100; empty if it cannot be encoded."""
+    import cv2
+
+    good, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return data.tobytes() if good else b""
 
 
 def decode_jpeg(data: bytes) -> npt.NDArray[np.uint8] | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.files import completed_file
 from protocols.formats.trc import read_grid
 
 
@@ -31,11 +32,8 @@ def write_c3d(source: Path, out: Path, units: str) -> None:
     file["parameters"]["POINT"]["LABELS"]["value"] = list(grid.labels)
     file["data"]["points"] = points
     file["data"]["meta_points"]["residuals"] = np.where(missing, -1.0, 0.0)[None]
-    part = out.with_name(f".{out.stem}.part.c3d")
     try:
-        file.write(str(part))
-        part.replace(out)
+        with completed_file(out) as part:
+            file.write(str(part))
     except (OSError, RuntimeError) as error:
         raise InputError(f"cannot be written: {error}", file=out, remedy="choose another --out") from None
-    finally:
-        part.unlink(missing_ok=True)

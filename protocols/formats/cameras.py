@@ -133,6 +133,17 @@ def parse_array(value: Any, shape: tuple[int, ...], what: str, file: Path, line:
     return array
 
 
+def parse_time_map(table: Mapping[str, Any], what: str, file: Path, line: int | None) -> TimeMap | None:
+    """A table's time_offset and clock_rate, which Syncline's exports add; None without. Raises InputError."""
+    if "time_offset" not in table:
+        return None
+    pair = [table.get("clock_rate", 1.0), table["time_offset"]]
+    rate, offset = parse_array(pair, (2,), f"{what}clock_rate, time_offset", file, line)
+    if rate <= 0:
+        raise InputError(f"{what}clock_rate = {rate:g}", file=file, line=line, remedy="give a rate above 0")
+    return TimeMap(float(rate), float(offset))
+
+
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Floats:
     """(3, 3) camera matrix."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
 from protocols.core.files import read_toml
-from protocols.formats.cameras import ExportedFiles, ForeignCamera, ForeignRig, convert_units, parse_array
+from protocols.formats.cameras import ExportedFiles, ForeignCamera, ForeignRig, convert_units, parse_time_map
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.session.calibration import CameraCalibration
@@ -138,13 +137,7 @@ def _foreign(camera: RigCamera, table: Mapping[str, Any], file: Path, where: str
     pose = None
     if camera.rotation is not None and camera.position is not None:
         pose = Pose(camera.rotation, camera.position)
-    time_map = None
-    if "time_offset" in table:
-        pair = [table.get("clock_rate", 1.0), table["time_offset"]]
-        rate, offset = parse_array(pair, (2,), f"[{where}] clock_rate, time_offset", file, None)
-        if rate <= 0:
-            raise InputError(f"[{where}] clock_rate = {rate:g}", file=file, remedy="give a rate above 0")
-        time_map = TimeMap(float(rate), float(offset))
+    time_map = parse_time_map(table, f"[{where}] ", file, None)
     return ForeignCamera(camera.name, camera.intrinsics, pose, time_map)
 
 

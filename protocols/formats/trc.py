@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from protocols.core.errors import InputError
-from protocols.core.files import read_text
 from protocols.geometry.types import Floats, Ints
 from protocols.session.rig import METRES_PER_UNIT
+from protocols.session.trajectory import read_labelled_rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +26,10 @@ class TrajectoryGrid:
 
 def read_grid(file: Path, units: str, wanted: str) -> TrajectoryGrid:
     """A trajectory.csv or track.csv in ``wanted`` units on a grid. Raises InputError: file, line, what, remedy."""
-    paths = _read_paths(file)
+    remedy = "give the trajectory.csv of `calibrate` or the track.csv of `triangulate`"
+    paths = read_labelled_rows(file, ("time", "x", "y", "z"), remedy)
+    if not paths:
+        raise InputError("no rows", file=file, line=1, remedy=remedy)
     times, frames = grid_frames(paths)
     count = int(frames[-1]) + 1
     rate = (count - 1) / float(times[-1] - times[0]) if count > 1 else 1.0
@@ -78,25 +79,3 @@ def grid_frames(paths: Mapping[str, Floats]) -> tuple[Floats, Ints]:
     step = float(np.quantile(steps, 0.1, method="lower"))
     ahead = np.maximum(np.rint(np.diff(times) / step), 1).astype(np.int64)
     return times, np.r_[np.zeros(1, dtype=np.int64), np.cumsum(ahead)]
-
-
-def _read_paths(file: Path) -> dict[str, Floats]:
-    """time, x, y, z (n, 4) by label."""
-    remedy = "give the trajectory.csv of `calibrate` or the track.csv of `triangulate`"
-    reader = csv.DictReader(io.StringIO(read_text(file, "trajectory")))
-    missing = [key for key in ("time", "x", "y", "z") if key not in (reader.fieldnames or [])]
-    if missing:
-        raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
-    rows: dict[str, list[list[float]]] = {}
-    for row in reader:
-        try:
-            values = [float(row[key]) for key in ("time", "x", "y", "z")]
-        except (TypeError, ValueError):
-            what = "time, x, y, z are not four numbers"
-            raise InputError(what, file=file, line=reader.line_num, remedy="correct or remove the row") from None
-        if not np.isfinite(values).all():
-            raise InputError("a value is not finite", file=file, line=reader.line_num, remedy="remove the row")
-        rows.setdefault(row.get("label") or "marker", []).append(values)
-    if not rows:
-        raise InputError("no rows", file=file, line=1, remedy=remedy)
-    return {label: np.array(values) for label, values in rows.items()}

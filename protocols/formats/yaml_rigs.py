@@ -25,6 +25,7 @@ from protocols.formats.cameras import (
     check_skew,
     fit_without_k3,
     parse_array,
+    parse_time_map,
     pinhole_matrix,
 )
 from protocols.geometry import so3
@@ -114,7 +115,7 @@ def read_kalibr(file: Path) -> ForeignRig:
     shifts: list[float | None] = []
     body: list[tuple[Floats, Floats] | None] = []
     lenses: dict[str, Intrinsics] = {}
-    own: dict[str, TimeMap] = {}
+    own: dict[str, TimeMap | None] = {}
     for key, table in values.items():
         if not isinstance(table, dict) or "intrinsics" not in table:
             continue
@@ -133,12 +134,7 @@ def read_kalibr(file: Path) -> ForeignRig:
         shifts.append(
             None if given is None else float(parse_array(given, (), f"{key} timeshift_cam_imu", file, shift_at))
         )
-        if "time_offset" in table:
-            pair = [table.get("clock_rate", 1.0), table["time_offset"]]
-            rate, offset = parse_array(
-                pair, (2,), f"{key} time_offset, clock_rate", file, _line(text, "time_offset", key)
-            )
-            own[name] = TimeMap(float(rate), float(offset))
+        own[name] = parse_time_map(table, f"{key} ", file, _line(text, "time_offset", key))
     if not lenses:
         raise InputError("no camera with intrinsics in it", file=file, remedy="give Kalibr's camchain YAML")
     bodies = [pose for pose in body if pose is not None]
@@ -149,7 +145,7 @@ def read_kalibr(file: Path) -> ForeignRig:
     timed = all(shift is not None for shift in shifts)
     for number, (name, lens) in enumerate(lenses.items()):
         pose = None if whole is None else Pose(whole[number][0], -whole[number][0].T @ whole[number][1])
-        time_map = own.get(name)
+        time_map = own[name]
         if time_map is None and timed:
             # t_imu = t_cam + shift for each: the first camera's clock is the reference.
             time_map = TimeMap(1.0, float(shifts[number] or 0.0) - float(shifts[0] or 0.0))
@@ -231,12 +227,7 @@ def _opencv_camera(values: Mapping[str, Any], text: str, file: Path) -> ForeignC
         turn = parse_array(_rows(values["R"]), (9,), "R", file, _line(text, "R")).reshape(3, 3)
         shift = parse_array(_rows(values["T"]), (3,), "T", file, _line(text, "T"))
         pose = _pose(turn, shift, "R", file, _line(text, "R"))
-    time_map = None
-    if "time_offset" in values:
-        pair = [values.get("clock_rate", 1.0), values["time_offset"]]
-        rate, offset = parse_array(pair, (2,), "clock_rate, time_offset", file, _line(text, "time_offset"))
-        time_map = TimeMap(float(rate), float(offset))
-    return ForeignCamera(name, lens, pose, time_map)
+    return ForeignCamera(name, lens, pose, parse_time_map(values, "", file, _line(text, "time_offset")))
 
 
 def _with_distortion(

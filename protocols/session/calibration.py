@@ -15,6 +15,7 @@ from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
 from protocols.core.files import read_toml
 from protocols.core.pair_report import PairReport
+from protocols.core.version import VERSION
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
@@ -136,6 +137,20 @@ class Calibration:
     residuals: dict[str, Floats] = field(default_factory=dict)
     convergence: tuple[AdjustmentStep, ...] = ()
     acceptance: Mapping[str, Sequence[AcceptanceTest]] = field(default_factory=dict)
+
+
+def stated_calibration(rig: Rig, cameras: dict[str, CameraCalibration]) -> Calibration:
+    """The result that a calibration.toml states, as ``read_calibration`` gives it: without trajectories and tests."""
+    metadata, refused = rig.metadata, rig.metadata.get("refused")
+    return Calibration(
+        cameras,
+        str(metadata.get("reference") or next(iter(cameras), "")),
+        str(metadata.get("scale", "metric")),
+        rig.units,
+        str(metadata.get("solver", "")),
+        str(metadata.get("version", VERSION)),
+        {str(name): str(why) for name, why in refused.items()} if isinstance(refused, dict) else {},
+    )
 
 
 def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:

@@ -285,27 +285,21 @@ def gather_columns(
     for start, end, repeated in zip(starts, ends, repeats, strict=True):
         part = slice(start, end)
         camera, label = camera_names[c[start]], label_names[k[start]]
+        one = Track(camera, label, frame[part], time[part], pixels[part], size[part])
         if repeated:
-            lines_of = None if line is None else line[part]
-            _check_repeats(camera, label, frame[part], time[part], lines_of, file, warnings, frames_may_repeat)
-        tracks[camera, label] = Track(camera, label, frame[part], time[part], pixels[part], size[part])
+            _check_repeats(one, None if line is None else line[part], file, warnings, frames_may_repeat)
+        tracks[camera, label] = one
         if std is not None:
             tracks[camera, label] = replace(tracks[camera, label], std=std[part])
     return Observations(tracks, tuple(warnings))
 
 
 def _check_repeats(
-    camera: str,
-    label: str,
-    frame: Ints,
-    time: Floats,
-    line: Ints | None,
-    file: Path | None,
-    warnings: list[str],
-    frames_may_repeat: bool,
+    track: Track, line: Ints | None, file: Path | None, warnings: list[str], frames_may_repeat: bool
 ) -> None:
+    time, frame = track.time, track.frame
     same_time = np.flatnonzero(np.diff(time) == 0)
-    where = f"camera {camera}, label {label}" if label != DEFAULT_LABEL else f"camera {camera}"
+    where = f"camera {track.camera}" + (f", label {track.label}" if track.label != DEFAULT_LABEL else "")
     if len(same_time):
         i = int(same_time[0])
         raise InputError(

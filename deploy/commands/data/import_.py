@@ -108,7 +108,7 @@ def import_(
     warnings: tuple[str, ...] = ()
     if source.kind == "session":
         folder, arrivals = source.files[0], None
-        objects = session_log.has_objects(folder)
+        objects = session_log.objects_file(folder) is not None
         session = None if objects else read_folder(folder)
         if calibration is not None:
             timed_rig = read_rig(calibration) if session is None else session[0]

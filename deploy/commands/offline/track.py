@@ -81,7 +81,8 @@ def track(
     from deploy.evaluation.track_scores import read_truth, score
     from deploy.offline import track as tracking
     from deploy.offline.track_log import LoggedFlightImages, open_recording
-    from deploy.offline.track_overlay import Overlay
+    from deploy.offline.track_overlay import draw
+    from edge.devices.playback.video_writer import video_writer
     from edge.uav import tracker_factory
 
     box = tracking.parse_target(target)
@@ -107,7 +108,10 @@ def track(
     rows: list[tracking.TrackedFrame] = []
     with ExitStack() as stack:
         progress = stack.enter_context(progress_bar(f"tracking in {video.name}", quiet=json))
-        film = stack.enter_context(Overlay(out / tracking.OVERLAY, recording.info.fps)) if overlay else None
+        write = None
+        if overlay:
+            film = video_writer(out / tracking.OVERLAY, recording.info.fps, "leave out --overlay")
+            write = stack.enter_context(film)
         stack.callback(recording.close)
 
         def frame_done(index: int) -> None:
@@ -119,19 +123,17 @@ def track(
             box,
             start=start,
             telemetry=samples,
-            show=film.show if film is not None else None,
+            show=None if write is None else lambda image, tracked: write(draw(image, tracked)),
             progress=frame_done,
         ):
             # Particles and layers are only for the overlay, and would fill the memory for a long video.
-            rows.append(tracking.without_overlay_data(row))
+            rows.append(replace(row, estimate=replace(row.estimate, particles=None, layers={})))
         write_together(
             {
                 out / tracking.TRACK: tracking.track_text(rows),
                 out / tracking.HYPOTHESES: tracking.hypotheses_text(rows),
             }
         )
-        if film is not None:
-            film.finish()
     if count and rows[-1].frame + 1 < count:
         warnings.append(f"{video}: {rows[-1].frame + 1} of {count} frames could be decoded")
     if recording.repaired:

@@ -13,6 +13,7 @@ from deploy.offline.csv_table import read_csv_header
 from deploy.offline.follow.objects import BOXES_FILE, complete_detections, is_boxes_file, object_messages, read_objects
 from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.errors import InputError
+from protocols.core.files import completed_file
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration, read_calibration
@@ -56,11 +57,6 @@ def session_to_log(rig: Rig, observations: Observations, out: Path, arrivals: Ar
     return _write_log(out, infos, rig, _with_log_times(_observation_messages(rig, observations), arrivals))
 
 
-def has_objects(folder: Path) -> bool:
-    """Whether a session folder holds detections of objects, several of one label in a frame, or boxes."""
-    return _objects_file(folder) is not None
-
-
 def objects_to_log(
     folder: Path, calibration: Path | None, out: Path, arrivals: Arrivals | None
 ) -> tuple[Rig, int, int]:
@@ -71,7 +67,7 @@ def objects_to_log(
     calibration: gives cameras and lenses in place of the folder's rig.toml. Returns the rig, and the numbers of
     detections and messages. Raises InputError.
     """
-    file = _objects_file(folder)
+    file = objects_file(folder)
     assert file is not None
     if calibration is None and not (folder / RIG_FILE).exists():
         raise InputError(f"no {RIG_FILE} in this folder", file=folder, remedy="give --calibration CALIB.toml")
@@ -84,7 +80,7 @@ def objects_to_log(
     return rig, len(rows), _write_log(out, infos, rig, _with_log_times(messages, arrivals))
 
 
-def _objects_file(folder: Path) -> Path | None:
+def objects_file(folder: Path) -> Path | None:
     file = folder / OBSERVATIONS_FILE
     if not file.exists():
         boxes = folder / BOXES_FILE
@@ -118,8 +114,6 @@ def _write_log(out: Path, infos: Sequence[pb.CameraInfo], rig: Rig, frames: list
 
     if out.exists():
         raise InputError("this file exists already", file=out, remedy="choose another --out: logs are not replaced")
-    part = out.with_name(f".{out.stem}.part.mcap")
-    part.unlink(missing_ok=True)
     begins = {message.camera: at for at, message in reversed(frames)}
     boots = {message.camera: message.boot_id for _, message in frames}
     messages: list[tuple[int, Topic, str, Message]] = [(0, RIG_INFO, "import", _rig_info(rig))]
@@ -127,13 +121,9 @@ def _write_log(out: Path, infos: Sequence[pb.CameraInfo], rig: Rig, frames: list
         info.boot_id = boots.get(info.camera, info.boot_id)
         messages.append((begins.get(info.camera, 0), CAMERA_INFO, info.camera, info))
     messages += [(at, OBSERVATION, message.camera, message) for at, message in frames]
-    try:
-        with LogWriter(part, views=True) as writer:
-            for at, topic, name, message in sorted(messages, key=lambda entry: entry[0]):
-                writer.write(topic, name, "import", message, at)
-        part.replace(out)
-    finally:
-        part.unlink(missing_ok=True)
+    with completed_file(out) as part, LogWriter(part, views=True) as writer:
+        for at, topic, name, message in sorted(messages, key=lambda entry: entry[0]):
+            writer.write(topic, name, "import", message, at)
     return len(messages)
 
 

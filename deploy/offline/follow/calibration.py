@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from protocols.core.version import VERSION
 from protocols.geometry.types import Floats
-from protocols.session.calibration import Calibration, read_calibration
+from protocols.session.calibration import Calibration, read_calibration, stated_calibration
 from protocols.session.rig import Rig
 
 _ANY_SIZE = 1_000_000  # px: larger than any image, so that none is refused for its size
@@ -43,17 +42,7 @@ class GivenCalibration:
 def read_given_calibration(file: Path) -> GivenCalibration:
     """Read calibration.toml. Raises InputError."""
     rig, cameras = read_calibration(file)
-    metadata = rig.metadata
-    refused = metadata.get("refused")
-    calibration = Calibration(
-        cameras=cameras,
-        reference=str(metadata.get("reference", next(iter(cameras)))),
-        scale=str(metadata.get("scale", "metric")),
-        units=rig.units,
-        solver=str(metadata.get("solver", "")),
-        version=str(metadata.get("version", VERSION)),
-        refused={str(name): str(why) for name, why in refused.items()} if isinstance(refused, dict) else {},
-    )
+    calibration = stated_calibration(rig, cameras)
     up = rig.up
     if isinstance(up, str):
         up = cameras[up].pose.rotation.T @ rig.up_in_camera(up)

@@ -55,7 +55,7 @@ def follow_report(result: FollowResult, source: FollowInput, known: GivenCalibra
     seen = _seen(result, source, known)
     span = document["first_time"], document["last_time"]
     shown = _longest(tracks)
-    noun = _plural(document["kind"], len(tracks))
+    noun = document["kind"] if len(tracks) == 1 else {"person": "people", "vehicle": "vehicles"}[document["kind"]]
     headline = f"{whole(len(tracks))} {noun} followed through {len(result.cameras)} cameras"
     left = f"The {len(shown)} longest of {whole(len(tracks))} tracks. " if len(shown) < len(tracks) else ""
     parts = [
@@ -97,12 +97,6 @@ def follow_report(result: FollowResult, source: FollowInput, known: GivenCalibra
         section("Provenance", "", _provenance(source, known, document)),
     ]
     return html_page("Tracks", headline, parts)
-
-
-def _plural(kind: str, count: int) -> str:
-    return (
-        {"person": "person", "vehicle": "vehicle"}[kind] if count == 1 else {"person": "people"}.get(kind, "vehicles")
-    )
 
 
 def _longest(tracks: Sequence[FollowedTrack]) -> list[FollowedTrack]:

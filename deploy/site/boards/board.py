@@ -48,7 +48,6 @@ def request(role: str, agent: str, root: Path = Path("/")) -> str:
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
-    from cryptography.x509.oid import NameOID
 
     folder = folder_of(role, agent, root)
     try:
@@ -59,8 +58,7 @@ def request(role: str, agent: str, root: Path = Path("/")) -> str:
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", file=folder, remedy="run it as root (sudo)") from None
     name = certificate_name("record" if role == "recorder" else role, agent)
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    made = x509.CertificateSigningRequestBuilder().subject_name(subject).sign(key, hashes.SHA256())
+    made = x509.CertificateSigningRequestBuilder().subject_name(keys.subject_name(name)).sign(key, hashes.SHA256())
     return made.public_bytes(serialization.Encoding.PEM).decode("ascii")
 
 

@@ -105,7 +105,7 @@ def bus_path(bus: BusConfig, site: str, role: str, agent: str, patience_s: float
             return _check_subscriber(config, site, agent, where)
         from protocols.bus.router.probe import round_trip
 
-        prefix = _own_prefix(site, role, agent) if bus.tls is not None else f"syncline/{site}/canary/doctor"
+        prefix = f"syncline/{site}/{'canary' if bus.tls is None else f'agent/{key_segment(agent)}'}/doctor"
         small = round_trip(config, prefix, _SMALL)
         if small is None:
             return unavailable(
@@ -195,10 +195,6 @@ def configuration(file: Path, role: str) -> tuple[CheckResult, Any]:
         place = f"{error.file or file}" + (f":{error.line}" if error.line else "")
         return misconfigured("configuration", f"{place}: {error.what}", error.remedy or "correct it"), None
     return ok("configuration", f"{role} {getattr(config, 'id', '')} of site {getattr(config, 'site', '')}"), config
-
-
-def _own_prefix(site: str, role: str, agent: str) -> str:
-    return f"syncline/{site}/agent/{key_segment(agent)}/doctor"
 
 
 def _as_client(bus: BusConfig) -> BusConfig | None:

@@ -11,15 +11,15 @@ import os
 import platform
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 from deploy.site.doctor.check_result import CheckResult, misconfigured, ok, skip, warn
-from edge.agents.clock_quality import kernel_clock
+from edge.agents.clock_quality import kernel_clock, run_command
 from protocols.core.clocks import UNSET_CLOCK_UNIX_S, utc_text
 
 PACKAGES: dict[str, tuple[str, ...]] = {
@@ -100,20 +100,13 @@ def cpu(root: Path = Path("/"), machine: str | None = None) -> CheckResult:
             f"{kind} without {', '.join(lacking)}",
             "use a newer processor: NumPy and OpenCV end with SIGILL here",
         )
-    hot = max((_celsius(file) for file in root.glob("sys/class/thermal/thermal_zone*/temp")), default=0.0)
+    hot = max((_number(file) / 1000.0 for file in root.glob("sys/class/thermal/thermal_zone*/temp")), default=0.0)
     cores = words.count("processor")
     if hot >= _MAX_TEMPERATURE_C:
         return warn(
             "cpu", f"{kind}, {cores} cores, {hot:.0f} °C", "cool it: it slows down when hot, and frames are lost"
         )
     return ok("cpu", f"{kind}, {cores} cores" + (f", {hot:.0f} °C" if hot else ""))
-
-
-def _celsius(file: Path) -> float:
-    try:
-        return int(file.read_text(encoding="utf-8")) / 1000.0
-    except (OSError, ValueError):
-        return 0.0
 
 
 def disk(folder: Path, least_mb: float = 0.0, free: Callable[[Path], int] | None = None) -> CheckResult:
@@ -151,7 +144,7 @@ def usb(source: str, root: Path = Path("/")) -> CheckResult:
     sharing = sum(
         _bus_number((node / "device").resolve()) == controller
         for node in root.glob("sys/class/video4linux/video*")
-        if _index(node) == 0
+        if _number(node / "index") == 0
     )
     text = f"{name}: {speed:g} Mbit/s, {sharing} camera{'s' if sharing != 1 else ''} on bus {controller}"
     if speed < 480.0:
@@ -201,9 +194,9 @@ def _bus_number(device: Path) -> str:
     return next((_text(place / "busnum") for place in (device, *device.parents) if (place / "busnum").is_file()), "")
 
 
-def _index(node: Path) -> int:
-    text = _text(node / "index")
-    return int(text) if text.isdecimal() else 0
+def _number(file: Path) -> int:
+    text = _text(file)
+    return int(text) if text.removeprefix("-").isdecimal() else 0
 
 
 def _text(file: Path) -> str:
@@ -249,13 +242,7 @@ def time_source(ask: Run) -> str:
     return "none known"
 
 
-def run(command: Sequence[str]) -> tuple[int, str]:
-    """(exit status, output) of a command; status 127 if it does not exist."""
-    try:
-        ended = subprocess.run(list(command), capture_output=True, text=True, timeout=10.0, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return 127, ""
-    return ended.returncode, ended.stdout
+run = partial(run_command, timeout_s=10.0)
 
 
 _CRASHES = {

@@ -17,7 +17,7 @@ import tomli_w
 from deploy.config.file import KnownName, Source, load
 from deploy.site.install import units
 from protocols.core.errors import InputError, Refused
-from protocols.core.files import read_toml
+from protocols.core.files import read_toml, write_private
 from protocols.core.names import key_segment
 from protocols.session.rig import read_rig
 
@@ -96,7 +96,8 @@ def plan_install(role: str, file: Path, program: str | None = None) -> Plan:
             _set(table, path, _source(value, file, path))
         else:
             place, content = _referenced(value, file, path, folder, taken)
-            plan.add(place, content, 0o600 if _is_secret(value) else 0o640)
+            secret = value.suffix in (".key", ".pem") or "key" in value.stem
+            plan.add(place, content, 0o600 if secret else 0o640)
             base = place.rpartition("/")[2]
             small = len(content) <= _CREDENTIAL_BYTES
             if small:
@@ -183,7 +184,8 @@ def apply(plan: Plan, root: Path) -> list[str]:
             now = _in(root, place)
             if now.is_file() and now.read_bytes() == content and now.stat().st_mode & 0o777 == plan.modes[place]:
                 continue
-            _write(now, content, plan.modes[place])
+            now.parent.mkdir(parents=True, exist_ok=True)
+            write_private(now, content, plan.modes[place])
             changes.append(f"wrote {place}")
         for place, target in plan.links.items():
             now = _in(root, place)
@@ -212,21 +214,6 @@ def _commands(plan: Plan, *, changed: bool) -> list[list[str]]:
     return [
         ["systemctl", "start", *command[2:]] for command in plan.commands if command[:2] == ["systemctl", "restart"]
     ]
-
-
-def _write(place: Path, content: bytes, mode: int) -> None:
-    place.parent.mkdir(parents=True, exist_ok=True)
-    beside = place.with_name(f".{place.name}.new")
-    handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    try:
-        with os.fdopen(handle, "wb") as out:
-            out.write(content)
-            out.flush()
-            os.fsync(out.fileno())
-        beside.chmod(mode)
-        beside.replace(place)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def _run(commands: list[list[str]], changes: list[str]) -> None:
@@ -319,10 +306,6 @@ def _referenced(value: Path, file: Path, path: tuple[str, ...], folder: str, tak
     base = value.name if value.name not in taken else f"{'-'.join(path)}-{value.name}"
     taken.add(base)
     return f"{folder}/{base}", content
-
-
-def _is_secret(file: Path) -> bool:
-    return file.suffix in (".key", ".pem") or "key" in file.stem
 
 
 def _running_program() -> str:

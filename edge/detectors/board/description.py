@@ -117,14 +117,9 @@ class Board:
         }
 
 
-def dictionary_names() -> dict[str, str]:
-    """OpenCV's constant of each dictionary by its name without ``DICT_``, in capitals."""
-    return {name[5:].upper(): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
-
-
 def load_dictionary(name: str) -> Any:
     """OpenCV's dictionary of this name, with or without ``DICT_``. Raises InputError."""
-    names = dictionary_names()
+    names = {name[5:].upper(): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
     wanted = name.upper().removeprefix("DICT_")
     if wanted not in names:
         close = difflib.get_close_matches(wanted, names, 3, 0.5)

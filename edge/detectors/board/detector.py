@@ -35,20 +35,15 @@ Box = tuple[int, int, int, int]
 
 
 class BoardDetector:
-    """Detects the corners of a board whose print is known; labels are those of ``Board.points``."""
+    """Detects the corners of a board whose print is known, ``board``; labels are those of ``Board.points``."""
 
     def __init__(self, board: Board, enlarged: float = _ENLARGED) -> None:
         self._enlarged = enlarged
-        self._board = next(iter(board.prints()))
-        self._finder = Finder(self._board)
+        self.board = next(iter(board.prints()))
+        self._finder = Finder(self.board)
         self._last: Floats | None = None
         self._missed = 0
         self._order: Floats | None = None
-
-    @property
-    def board(self) -> Board:
-        """The board in the print that is searched."""
-        return self._board
 
     def detect(
         self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
@@ -68,10 +63,10 @@ class BoardDetector:
         """Numbers and pixels of the corners in the next image (H, W) of this camera."""
         corners = self._search_nearby(grey)
         if corners is None:
-            search = self._search_saddles if self._board.kind == "chessboard" else self._search_whole
+            search = self._search_saddles if self.board.kind == "chessboard" else self._search_whole
             corners = search(grey, self._tile(grey.shape) if max(grey.shape) > SEARCH_PX else None)
         found = len(corners[0]) > 0
-        if found and self._board.symmetric:
+        if found and self.board.symmetric:
             corners = corners[0], self._as_before(corners[1])
         self._last = corners[1] if found else None
         self._missed = 0 if found else self._missed + 1
@@ -104,7 +99,7 @@ class BoardDetector:
 
         OpenCV's finders take seconds for an image with much texture and no board.
         """
-        rows, columns = (count - 1 for count in self._board.squares or (0, 0))
+        rows, columns = (count - 1 for count in self.board.squares or (0, 0))
         whole = 0, 0, grey.shape[1], grey.shape[0]
         levels = [(whole, SEARCH_PX // 2), (whole, SEARCH_PX), *([(tile, SEARCH_PX)] if tile else [])]
         for box, longest in levels:
@@ -123,7 +118,7 @@ class BoardDetector:
         """The corners around the last place; None if that is not known, or too few are there."""
         if self._last is None:
             return None
-        margin = _NEAR if self._board.kind == "chessboard" else _MARGIN
+        margin = _NEAR if self.board.kind == "chessboard" else _MARGIN
         corners = self._search_around(grey, self._last.min(axis=0), self._last.max(axis=0), False, margin)
         return corners if len(corners[0]) >= max(_KEPT_SHARE * len(self._last), 1.0) else None
 
@@ -132,7 +127,7 @@ class BoardDetector:
         reach = margin * max(float((high - low).max()), 60.0)
         x, y = np.maximum(np.floor(low - reach), 0).astype(int).tolist()
         right, bottom = np.minimum(np.ceil(high + reach), [grey.shape[1], grey.shape[0]]).astype(int).tolist()
-        most = _TRACK_PX if self._board.kind == "chessboard" else _TRACK_PX_OF_TAGS
+        most = _TRACK_PX if self.board.kind == "chessboard" else _TRACK_PX_OF_TAGS
         resolution_kept = (1.0 + 2.0 * margin) / (1.0 + 2.0 * _MARGIN)
         return self._search(grey, (x, y, right, bottom), round(most * resolution_kept), thorough)
 
@@ -142,7 +137,7 @@ class BoardDetector:
         part = np.ascontiguousarray(grey[y:bottom, x:right])
         if min(part.shape) < 24:
             return self._finder.find(part)
-        scale = min(1.0 if self._board.kind == "chessboard" else self._enlarged, most / max(part.shape))
+        scale = min(1.0 if self.board.kind == "chessboard" else self._enlarged, most / max(part.shape))
         size = max(round(part.shape[1] * scale), 1), max(round(part.shape[0] * scale), 1)
         kernel = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
         resized = part if scale == 1.0 else np.asarray(cv2.resize(part, size, interpolation=kernel), dtype=np.uint8)

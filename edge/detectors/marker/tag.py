@@ -87,7 +87,8 @@ class TagDetector:
             return None
         lines, covariances, contrast, scatter, width, blur_std = sides
         corners = _corners(lines)
-        if corners is None or np.abs(corners - quad).max() > 3.0 + 0.1 * _side(quad):
+        side = float(np.linalg.norm(quad - np.roll(quad, -1, axis=0), axis=1).mean())
+        if corners is None or np.abs(corners - quad).max() > 3.0 + 0.1 * side:
             return None
         centre, size = _centre(corners)
         if size < self._model.min_size or scatter > _MAX_SCATTER * size:
@@ -115,10 +116,6 @@ def _detector(name: str) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family)), parameters)
-
-
-def _side(quad: Floats) -> float:
-    return float(np.linalg.norm(quad - np.roll(quad, -1, axis=0), axis=1).mean())
 
 
 def _measure_sides(

@@ -59,13 +59,8 @@ class VehicleDetector(SilhouetteDetector):
         super().__init__(model, fps, prefix, 1.0, confirmed_only, _MAX_PIXELS)
         self._motion_given = moving
         self._shifts: deque[float] = deque(maxlen=_DECISION_FRAMES)
-        self._moving = bool(moving)
+        self.moving = bool(moving)
         self._compensated = _CompensatedBackground()
-
-    @property
-    def moving(self) -> bool:
-        """Whether the camera is assumed to move."""
-        return self._moving
 
     def initialise(self, images: Sequence[Image]) -> None:
         """Learn a fixed camera's background from images over a longer time; no effect for a moving camera."""
@@ -77,8 +72,8 @@ class VehicleDetector(SilhouetteDetector):
             travel = _camera_shift(small)
             if travel is None:
                 return  # decided at the first frames
-            self._motion_given = self._moving = travel > _MOVING_TRAVEL_PX
-        if self._moving:
+            self._motion_given = self.moving = travel > _MOVING_TRAVEL_PX
+        if self.moving:
             return
         self._foreground.initialise(small)
 
@@ -95,7 +90,7 @@ class VehicleDetector(SilhouetteDetector):
         self._set_size(image)
         now = self._advance(time_s)
         small = self._downscaled(image)
-        if self._motion_given is None or self._moving:
+        if self._motion_given is None or self.moving:
             self._decide_camera_motion(small)
         foreground = self._foreground_mask(small, now)
         if foreground is None:
@@ -121,21 +116,21 @@ class VehicleDetector(SilhouetteDetector):
             self._compensated = _CompensatedBackground()
 
     def _decide_camera_motion(self, image: Image) -> None:
-        self._compensated.estimate_motion(image)
-        if math.isfinite(self._compensated.shift):
-            self._shifts.append(self._compensated.shift)
+        self._compensated.image_motion.estimate(image)
+        if math.isfinite(self._compensated.image_motion.shift):
+            self._shifts.append(self._compensated.image_motion.shift)
         if self._motion_given is not None or len(self._shifts) < _DECISION_FRAMES:
             return
         typical = float(np.median(self._shifts))
-        if not self._moving and typical > _MOVING_SHIFT_PX:
-            self._moving = True
-        elif self._moving and typical < 0.3 * _MOVING_SHIFT_PX and max(self._shifts) < _MOVING_SHIFT_PX:
-            self._moving = False
+        if not self.moving and typical > _MOVING_SHIFT_PX:
+            self.moving = True
+        elif self.moving and typical < 0.3 * _MOVING_SHIFT_PX and max(self._shifts) < _MOVING_SHIFT_PX:
+            self.moving = False
             self._foreground = BackgroundSubtractor(self._model, self._fps)
 
     def _foreground_mask(self, image: Image, now: float) -> Image | None:
         """Silhouettes (H, W) 0/255; None while the background is unknown."""
-        if self._moving:
+        if self.moving:
             raw = self._compensated.moving_pixels(image)
         else:
             if self._motion_given is None and len(self._shifts) < _DECISION_FRAMES:
@@ -213,7 +208,7 @@ class _CompensatedBackground:
     """A background that is warped along with the camera's motion."""
 
     def __init__(self) -> None:
-        self._image_motion = ImageMotion()
+        self.image_motion = ImageMotion()
         self._mean: npt.NDArray[np.float32] | None = None
         self._age: npt.NDArray[np.float32] | None = None
         self._stale: npt.NDArray[np.float32] = np.zeros((1, 1), np.float32)
@@ -222,19 +217,6 @@ class _CompensatedBackground:
         self._next_reference_age = 0
         self._reference_age = _REFERENCE_FRAMES
 
-    @property
-    def shift(self) -> float:
-        """Median motion of the corners in the last frame [px]."""
-        return self._image_motion.shift
-
-    @property
-    def _motion(self) -> Floats | None:
-        return self._image_motion.motion
-
-    def estimate_motion(self, image: Image) -> None:
-        """Estimate the image motion since the last frame."""
-        self._image_motion.estimate(image)
-
     def forget(self) -> None:
         """Forget the background; the image motion stays known."""
         self._mean = self._reference = self._next_reference = None
@@ -242,14 +224,15 @@ class _CompensatedBackground:
 
     def moving_pixels(self, image: Image) -> Image | None:
         """Pixels (H, W) 0/255 that do not move with the ground; None where the homography could not be estimated."""
+        motion = self.image_motion.motion
         size = image.shape[1], image.shape[0]
         soft = cv2.GaussianBlur(image, (5, 5), 0).astype(np.float32)
-        if self._mean is None or self._age is None or self._motion is None:
+        if self._mean is None or self._age is None or motion is None:
             self._mean, self._age = np.asarray(soft, dtype=np.float32), np.ones(image.shape[:2], np.float32)
             self._stale = np.zeros(image.shape[:2], np.float32)
-            return None if self._motion is None else np.zeros(image.shape[:2], np.uint8)
-        mean = cv2.warpPerspective(self._mean, self._motion, size, flags=cv2.INTER_LINEAR)
-        age = cv2.warpPerspective(self._age, self._motion, size, flags=cv2.INTER_NEAREST)
+            return None if motion is None else np.zeros(image.shape[:2], np.uint8)
+        mean = cv2.warpPerspective(self._mean, motion, size, flags=cv2.INTER_LINEAR)
+        age = cv2.warpPerspective(self._age, motion, size, flags=cv2.INTER_NEAREST)
         # Edges may be a pixel off: colours of the 3x3 neighbourhood belong to the background too.
         box = np.ones((3, 3), np.uint8)
         high, low = cv2.dilate(mean, box), cv2.erode(mean, box)
@@ -262,9 +245,9 @@ class _CompensatedBackground:
         rate = np.where(known, np.maximum(1.0 / (age + 1.0), _LEARNING_RATE), 1.0).astype(np.float32)
         # Passing objects are not learnt. Where an object of the first frame has left, the ground differs for long:
         # restart there.
-        stale = cv2.warpPerspective(self._stale, self._motion, size, flags=cv2.INTER_NEAREST)
+        stale = cv2.warpPerspective(self._stale, motion, size, flags=cv2.INTER_NEAREST)
         stale = np.where(different, stale + 1.0, 0.0).astype(np.float32)
-        uncovered = self._uncovered_ground(soft, different, size)
+        uncovered = self._uncovered_ground(soft, different, size, motion)
         different &= ~uncovered
         begin = (stale > _STALE_FRAMES) | uncovered
         rate[different] = 0.0
@@ -275,7 +258,7 @@ class _CompensatedBackground:
         return np.where(different, np.uint8(255), np.uint8(0)).astype(np.uint8)
 
     def _uncovered_ground(
-        self, soft: npt.NDArray[np.float32], different: npt.NDArray[np.bool_], size: tuple[int, int]
+        self, soft: npt.NDArray[np.float32], different: npt.NDArray[np.bool_], size: tuple[int, int], motion: Floats
     ) -> npt.NDArray[np.bool_]:
         """Ground (H, W) that was uncovered when an object of the first frame left.
 
@@ -283,17 +266,14 @@ class _CompensatedBackground:
         static too, but not its edges.
         """
         none = np.zeros(different.shape, dtype=np.bool_)
-        assert self._motion is not None
         if self._next_reference is None:
             self._next_reference = soft
             return none
-        self._next_reference = np.asarray(
-            cv2.warpPerspective(self._next_reference, self._motion, size), dtype=np.float32
-        )
+        self._next_reference = np.asarray(cv2.warpPerspective(self._next_reference, motion, size), dtype=np.float32)
         self._next_reference_age += 1
         if self._reference is not None:
             self._reference_age += 1
-            self._reference = np.asarray(cv2.warpPerspective(self._reference, self._motion, size), dtype=np.float32)
+            self._reference = np.asarray(cv2.warpPerspective(self._reference, motion, size), dtype=np.float32)
         reference = self._reference
         if self._next_reference_age >= _REFERENCE_FRAMES:
             self._reference, self._reference_age = self._next_reference, self._next_reference_age

@@ -100,7 +100,9 @@ class OakConnection:
         if message is None:
             return None
         middle = message.getTimestamp(dai.CameraExposureOffset.MIDDLE)
-        image = np.ascontiguousarray(_three_channels(message.getCvFrame()), dtype=np.uint8)
+        image = np.ascontiguousarray(message.getCvFrame(), dtype=np.uint8)
+        if image.ndim == 2:
+            image = np.repeat(image[:, :, None], 3, axis=2)
         time_ns = (middle // timedelta(microseconds=1)) * 1000
         detections = None
         if results is not None:
@@ -205,11 +207,6 @@ def open_archive(file: Path, labels: tuple[str, ...] = ()) -> Any:
         listed = ", ".join(known[:12]) + (", …" if len(known) > 12 else "")
         raise InputError(f"the network has no class {', '.join(unknown)}", file=file, remedy=f"use some of {listed}")
     return archive
-
-
-def _three_channels(image: Any) -> Any:
-    """(H, W, 3) of a colour or grey image."""
-    return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 
 def _one_line(error: Exception) -> str:

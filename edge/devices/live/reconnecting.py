@@ -120,7 +120,7 @@ class ReconnectingCamera:
         self._back_off = ReconnectBackOff()
         self._awaiting_frame = False  # reconnected, but no frame has come yet
         self._awaiting_since_s = 0.0
-        self._ended = False
+        self.ended = False
         self.reconnections = 0
 
     @property
@@ -131,14 +131,9 @@ class ReconnectingCamera:
         return self._info
 
     @property
-    def ended(self) -> bool:
-        """True once closed; an unplugged camera has not ended, it is reconnected."""
-        return self._ended
-
-    @property
     def disconnected(self) -> bool:
         """Whether the connection is lost; every ``read`` then tries to reconnect."""
-        return self._info is not None and not self._ended and (self._connection is None or self._awaiting_frame)
+        return self._info is not None and not self.ended and (self._connection is None or self._awaiting_frame)
 
     @property
     def temperature(self) -> float | None:
@@ -148,7 +143,7 @@ class ReconnectingCamera:
     def open(self) -> None:
         """Connect and wait for the first frame. Raises InputError if the camera does not answer or gives no frame."""
         self._connection = self._connect()
-        self._ended = False
+        self.ended = False
         started_s = self._now_s()
         first: Frame | None = None
         try:
@@ -172,7 +167,7 @@ class ReconnectingCamera:
 
         Raises InputError where the reconnected camera has another image size.
         """
-        if self._ended or self._info is None:
+        if self.ended or self._info is None:
             return None
         if self._first is not None:
             first, self._first = self._first, None
@@ -207,7 +202,7 @@ class ReconnectingCamera:
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
-        self._ended = True
+        self.ended = True
 
     def _numbered(self, frame: Frame) -> Frame:
         fps = 0.0 if self._info is None else self._info.fps

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 from edge.devices.live.opencv_capture import OpenCvCamera
@@ -19,7 +17,6 @@ def open_video(
     loop: bool = False,
     playback_clock: PlaybackClock | None = None,
     intrinsics: Intrinsics | None = None,
-    now_ns: Callable[[], int] = time.monotonic_ns,
 ) -> VideoPlayback | OpenCvCamera:
     """The device for a source, not yet open.
 
@@ -27,11 +24,9 @@ def open_video(
     udev); or a URL.
     fps: of a recording, replaces its time stamps; of a live camera, the requested rate. loop: repeat a recording, with
     continuing time stamps. playback_clock: the clock for playback in real time; None = as fast as possible.
-    intrinsics: of this camera. now_ns: the host's monotonic clock, which stamps live frames.
+    intrinsics: of this camera.
     """
     text = str(source)
-    if isinstance(source, int) or text.isdecimal() or text.startswith("/dev/"):
-        return OpenCvCamera(int(text) if text.isdecimal() else text, fps=fps, intrinsics=intrinsics, now_ns=now_ns)
-    if "://" in text:
-        return OpenCvCamera(text, fps=fps, intrinsics=intrinsics, now_ns=now_ns)
+    if isinstance(source, int) or text.isdecimal() or text.startswith("/dev/") or "://" in text:
+        return OpenCvCamera(int(text) if text.isdecimal() else text, fps=fps, intrinsics=intrinsics)
     return VideoPlayback(Path(source), fps=fps, loop=loop, playback_clock=playback_clock, intrinsics=intrinsics)

@@ -28,8 +28,12 @@ def check_recording(path: Path) -> None:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The images in a folder, by name."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    """The images in a folder, by name. Raises InputError if there are none."""
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    if not files:
+        kinds = ", ".join(sorted(IMAGE_SUFFIXES))
+        raise InputError("no images in this folder", file=folder, remedy=f"put {kinds} files in it")
+    return files
 
 
 def read_image(file: Path) -> Image | None:
@@ -72,7 +76,7 @@ class VideoPlayback:
         self._time = -math.inf  # [s] of the last frame
         self._loop_offset = 0.0  # [s] added by loops
         self._start_s: float | None = None  # playback clock time of device time 0
-        self._ended = False
+        self.ended = False
         self.repaired = 0
 
     @property
@@ -81,11 +85,6 @@ class VideoPlayback:
         if self._info is None:
             raise RuntimeError("open the recording first")
         return self._info
-
-    @property
-    def ended(self) -> bool:
-        """True after the last frame."""
-        return self._ended
 
     def open(self) -> None:
         """Raises InputError if no frame can be read."""
@@ -100,10 +99,10 @@ class VideoPlayback:
 
     def read(self, timeout_s: float) -> Frame | None:
         """The next frame, once it is due on the playback clock."""
-        if self._ended or self._info is None:
+        if self.ended or self._info is None:
             return None
         if self._pending is None and not self._advance():
-            self._ended = True
+            self.ended = True
             return None
         assert self._pending is not None
         time_s = self._next_time()
@@ -125,7 +124,7 @@ class VideoPlayback:
         if self._capture is not None:
             self._capture.release()
         self._capture = None
-        self._ended = True
+        self.ended = True
 
     def _rewind(self) -> Image:
         """(Re)open the source and return the first frame."""
@@ -133,9 +132,6 @@ class VideoPlayback:
         check_recording(self._path)
         if self._path.is_dir():
             self._image_files = image_files(self._path)
-            if not self._image_files:
-                kinds = ", ".join(sorted(IMAGE_SUFFIXES))
-                raise InputError("no images in this folder", file=self._path, remedy=f"put {kinds} files in it")
             return self._read_image(0)
         if self._capture is not None:
             self._capture.release()

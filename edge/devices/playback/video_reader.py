@@ -87,9 +87,6 @@ class VideoReader:
         return self._read_file() if has_pyav() else self._read_opencv()
 
     def _folder_info(self, fps: float) -> VideoInfo:
-        if not self._image_files:
-            kinds = ", ".join(sorted(IMAGE_SUFFIXES))
-            raise InputError("no images in this folder", file=self.path, remedy=f"put {kinds} files in it")
         for file in self._image_files:
             image = read_image(file)
             if image is not None:

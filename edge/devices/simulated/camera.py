@@ -75,7 +75,7 @@ class SimulatedDevice:
         self._start = 0.0
         self._frame = -1
         self._due = 0.0
-        self._ended = False
+        self.ended = False
         self.dropped = 0
         self.late = 0
 
@@ -93,22 +93,17 @@ class SimulatedDevice:
             readout_s=self._camera.readout_s,
         )
 
-    @property
-    def ended(self) -> bool:
-        """True after ``duration_s``, or once closed."""
-        return self._ended
-
     def open(self) -> None:
         """Create the renderer; the first frame is due a random fraction of a period from now."""
         self._renderer = renderer_for(self._scene, self._camera.name, self._sensor)
-        self._ended = False
+        self.ended = False
         self._frame = -1
         self._start = self._playback_clock.now() + self._capture.uniform(0.0, 1.0) * self._period
         self._next()
 
     def read(self, timeout_s: float) -> Frame | None:
         """The next frame, at the time at which a real camera would deliver it."""
-        if self._renderer is None or self._ended:
+        if self._renderer is None or self.ended:
             return None
         behind = self._playback_clock.now() - self._delivery
         if behind > self._period:  # rendering is too slow: skip frames and count them
@@ -116,7 +111,7 @@ class SimulatedDevice:
                 self.late += 1
                 self._next()
         if self._duration_s is not None and self._due - self._start > self._duration_s:
-            self._ended = True
+            self.ended = True
             return None
         if not wait_until(self._playback_clock, self._delivery, timeout_s):
             return None
@@ -133,7 +128,7 @@ class SimulatedDevice:
 
     def close(self) -> None:
         """No more frames."""
-        self._ended = True
+        self.ended = True
         self._renderer = None
 
     @property

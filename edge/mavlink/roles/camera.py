@@ -116,7 +116,7 @@ class CameraComponent:
             last is not None
             and last.same(message, parameters)
             and now_s - last.at_s < _REPEAT_WINDOW_S
-            and is_retransmission(message)
+            and int(getattr(message, "confirmation", 0)) > 0  # a retransmission
         ):
             # The ACK was lost: repeat it without executing the command again.
             self.counters["repeated"] += 1
@@ -255,11 +255,6 @@ class _AcknowledgedCommand:
 
     def same(self, message: Any, parameters: tuple[float, ...]) -> bool:
         return bool(self.command == message.command and repr(self.parameters) == repr(parameters))
-
-
-def is_retransmission(message: Any) -> bool:
-    """Whether the sender marks a command as a retransmission."""
-    return int(getattr(message, "confirmation", 0)) > 0
 
 
 _REQUESTS = {

@@ -158,10 +158,6 @@ class Vehicle:
         host_ns = min(host_ns, received.received_ns)
         return self._take(telemetry, host_ns, clock, quaternion=kind == "ATTITUDE_QUATERNION")
 
-    def command(self, command: int, component: int, *parameters: float) -> None:
-        """Send a COMMAND_LONG to a component of the vehicle."""
-        self._command(command, component, *parameters)
-
     def _message_rates(self) -> Iterable[tuple[str, float, int]]:
         yield "ATTITUDE_QUATERNION", self._rate_hz, AUTOPILOT
         yield "LOCAL_POSITION_NED", min(self._rate_hz, 20.0), AUTOPILOT

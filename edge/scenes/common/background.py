@@ -35,12 +35,29 @@ def room(rays: Floats, eye: Floats, half: float, height: float, rng: np.random.G
     texture = _Texture(rng)
     depth, colour = _shell(directions, eye, half, height, texture, rng)
     safe = np.ascontiguousarray(_without_zeros(directions).T)
-    for _ in range(7):
-        _add_box(directions, safe, eye, depth, colour, half, texture, rng)
-    for bgr in _BALL_BGR:
+    for _ in range(7):  # boxes on the floor
+        bgr = np.array(_BOX_BGR[int(rng.integers(len(_BOX_BGR)))], dtype=np.float64)
+        size = np.array([rng.uniform(0.2, 0.35), rng.uniform(0.2, 0.35), rng.uniform(0.2, 0.9)])
+        centre = np.array([*_by_the_wall(rng, half, 0.4), 0.5 * size[2]])
+        a, b = (centre - 0.5 * size - eye)[:, None] / safe, (centre + 0.5 * size - eye)[:, None] / safe
+        entry, leave = np.minimum(a, b), np.maximum(a, b)
+        near = entry.max(axis=0)
+        hit = (near < leave.min(axis=0)) & (near > 0.05) & (near < depth)
+        point = eye + near[hit, None] * directions[hit]
+        light = np.array([0.75, 0.62, 1.05])[entry[:, hit].argmax(axis=0)]
+        marks = texture.at(point[:, 0] * 5.0 + point[:, 1] * 3.0, point[:, 2] * 5.0)
+        colour[hit] = bgr * (light * (1.0 + 0.05 * marks))[:, None]
+        depth[hit] = near[hit]
+    for ball_bgr in _BALL_BGR:  # that are not the marker
         radius = rng.uniform(0.07, 0.14)
         centre = np.array([*_by_the_wall(rng, half, 0.4), radius])
-        _add_ball(directions, eye, depth, colour, centre, radius, np.array(bgr, dtype=np.float64))
+        closest = directions @ (centre - eye)
+        miss2 = (centre - eye) @ (centre - eye) - closest * closest
+        near = closest - np.sqrt(np.maximum(radius * radius - miss2, 0.0))
+        hit = (miss2 < radius * radius) & (near > 0.05) & (near < depth)
+        normal = (eye + near[hit, None] * directions[hit] - centre) / radius
+        colour[hit] = np.array(ball_bgr, np.float64) * (0.55 + 0.5 * np.clip(normal @ _LIGHT, 0.0, 1.0))[:, None]
+        depth[hit] = near[hit]
     return _finish(colour, rays.shape[:2])
 
 
@@ -117,8 +134,16 @@ def _shell(
     wall = _WALL_BGR[np.minimum(side, 3)] * (1.0 + 0.035 * texture.at(along * 3.0, hit[:, 2] * 3.0 + side))[:, None]
     skirting = hit[:, 2] < 0.1
     wall[skirting] = np.array([205, 212, 215.0])
-    for _ in range(6):
-        _paint_poster(wall, side, along, hit[:, 2], half, height, texture, rng)
+    for _ in range(6):  # posters
+        which, centre = int(rng.integers(4)), rng.uniform(-0.75, 0.75) * half
+        middle, w, h = rng.uniform(0.5, 0.75) * height, rng.uniform(0.2, 0.45), rng.uniform(0.2, 0.4)
+        base = np.array(_POSTER_BGR[int(rng.integers(len(_POSTER_BGR)))], dtype=np.float64)
+        other = np.array(_POSTER_BGR[int(rng.integers(len(_POSTER_BGR)))], dtype=np.float64)
+        x, y = np.abs(along - centre) / w, np.abs(hit[:, 2] - middle) / h
+        inside = (side == which) & (x < 1.0) & (y < 1.0)
+        wall[(side == which) & (x < 1.06) & (y < 1.06)] = np.array([60, 62, 64.0])
+        blend = np.clip(0.5 + texture.at(along[inside] * 2.5 + 9.0 * which, hit[inside, 2] * 2.5), 0, 1)[:, None]
+        wall[inside] = blend * base + (1.0 - blend) * other
     _paint_window(wall, side, along, hit[:, 2], int(rng.integers(4)), rng.uniform(-0.5, 0.5) * half)
     colour = np.where((side == 4)[:, None], _planks(hit, texture), wall)
     colour[side == 5] = np.array([222, 226, 226.0])
@@ -143,28 +168,6 @@ def _planks(hit: Floats, texture: _Texture) -> Floats:
     return np.asarray(colour)
 
 
-def _paint_poster(
-    wall: Floats,
-    side: npt.NDArray[np.int64],
-    along: Floats,
-    up: Floats,
-    half: float,
-    height: float,
-    texture: _Texture,
-    rng: np.random.Generator,
-) -> None:
-    which, centre = int(rng.integers(4)), rng.uniform(-0.75, 0.75) * half
-    middle, w, h = rng.uniform(0.5, 0.75) * height, rng.uniform(0.2, 0.45), rng.uniform(0.2, 0.4)
-    base = np.array(_POSTER_BGR[int(rng.integers(len(_POSTER_BGR)))], dtype=np.float64)
-    other = np.array(_POSTER_BGR[int(rng.integers(len(_POSTER_BGR)))], dtype=np.float64)
-    x, y = np.abs(along - centre) / w, np.abs(up - middle) / h
-    framed = (side == which) & (x < 1.06) & (y < 1.06)
-    inside = (side == which) & (x < 1.0) & (y < 1.0)
-    wall[framed] = np.array([60, 62, 64.0])
-    blend = np.clip(0.5 + texture.at(along[inside] * 2.5 + 9.0 * which, up[inside] * 2.5), 0, 1)[:, None]
-    wall[inside] = blend * base + (1.0 - blend) * other
-
-
 def _paint_window(
     wall: Floats, side: npt.NDArray[np.int64], along: Floats, up: Floats, which: int, centre: float
 ) -> None:
@@ -177,44 +180,6 @@ def _paint_window(
 def _without_zeros(directions: Floats) -> Floats:
     """The directions (n, 3) as divisors."""
     return np.asarray(np.where(np.abs(directions) < 1e-9, 1e-9, directions))
-
-
-def _add_box(
-    directions: Floats,
-    safe: Floats,
-    eye: Floats,
-    depth: Floats,
-    colour: Floats,
-    half: float,
-    texture: _Texture,
-    rng: np.random.Generator,
-) -> None:
-    """Add a box on the floor by the wall to depth (n,) and colour (n, 3). safe: (3, n) directions as divisors."""
-    bgr = np.array(_BOX_BGR[int(rng.integers(len(_BOX_BGR)))], dtype=np.float64)
-    size = np.array([rng.uniform(0.2, 0.35), rng.uniform(0.2, 0.35), rng.uniform(0.2, 0.9)])
-    centre = np.array([*_by_the_wall(rng, half, 0.4), 0.5 * size[2]])
-    a, b = (centre - 0.5 * size - eye)[:, None] / safe, (centre + 0.5 * size - eye)[:, None] / safe
-    entry, leave = np.minimum(a, b), np.maximum(a, b)
-    near = entry.max(axis=0)
-    hit = (near < leave.min(axis=0)) & (near > 0.05) & (near < depth)
-    point = eye + near[hit, None] * directions[hit]
-    light = np.array([0.75, 0.62, 1.05])[entry[:, hit].argmax(axis=0)]
-    marks = texture.at(point[:, 0] * 5.0 + point[:, 1] * 3.0, point[:, 2] * 5.0)
-    colour[hit] = bgr * (light * (1.0 + 0.05 * marks))[:, None]
-    depth[hit] = near[hit]
-
-
-def _add_ball(
-    directions: Floats, eye: Floats, depth: Floats, colour: Floats, centre: Floats, radius: float, bgr: Floats
-) -> None:
-    """Add a ball that is not the marker, by depth test. directions: (n, 3) unit vectors."""
-    closest = directions @ (centre - eye)
-    miss2 = (centre - eye) @ (centre - eye) - closest * closest
-    near = closest - np.sqrt(np.maximum(radius * radius - miss2, 0.0))
-    hit = (miss2 < radius * radius) & (near > 0.05) & (near < depth)
-    normal = (eye + near[hit, None] * directions[hit] - centre) / radius
-    colour[hit] = bgr * (0.55 + 0.5 * np.clip(normal @ _LIGHT, 0.0, 1.0))[:, None]
-    depth[hit] = near[hit]
 
 
 def _finish(colour: Floats, shape: tuple[int, ...]) -> npt.NDArray[np.uint8]:

@@ -38,6 +38,11 @@ class SimulatedClock:
         """
         return self.epoch_ns + round(self.rate * true_time * NANOSECONDS)
 
+    def stamps(self, true_time: Floats, rng: np.random.Generator) -> Floats:
+        """Its noisy stamps (n,) [s] at true times (n,) [s]."""
+        noise = np.rint(rng.normal(0.0, self.stamp_noise_s, len(true_time)) * NANOSECONDS).astype(np.int64)
+        return (np.array([self.device_time_ns(one) for one in true_time], dtype=np.int64) + noise) / NANOSECONDS
+
     def true_time(self, device_time_ns: int) -> float:
         """The true time [s] at which the clock reads ``device_time_ns``."""
         return (device_time_ns - self.epoch_ns) / NANOSECONDS / self.rate
@@ -63,16 +68,11 @@ class SimulatedCamera:
     drop_fraction: float = 0.02
     start_s: float = 0.0
 
-    def capture_times(
-        self, start: float, first: int, count: int, rng: np.random.Generator, jitter_s: float | None = None
-    ) -> Floats:
-        """True mid-exposure times (count,) [s] of frames ``first`` … of a recording that begins at ``start``.
-
-        jitter_s: in place of the camera's own.
-        """
+    def capture_times(self, start: float, first: int, count: int, rng: np.random.Generator) -> Floats:
+        """True mid-exposure times (count,) [s] of frames ``first`` … of a recording that begins at ``start``."""
         period = 1.0 / (self.fps * self.clock.rate)
         limit = 0.3 * period  # frames keep their order
-        jitter = np.clip(rng.normal(0.0, self.jitter_s if jitter_s is None else jitter_s, count), -limit, limit)
+        jitter = np.clip(rng.normal(0.0, self.jitter_s, count), -limit, limit)
         return np.asarray(start + (first + np.arange(count)) * period + jitter)
 
 

@@ -13,7 +13,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 
-_MIXED_FPS = (30.0, 25.0, 29.97, 50.0)  # PAL, NTSC and phones: no two cameras alike
+MIXED_FPS = (30.0, 25.0, 29.97, 50.0)  # PAL, NTSC and phones: no two cameras alike
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,6 @@ class CameraPlacement:
     focal: tuple[float, float]
     size: tuple[int, int]
     exposure_s: float
-    mixed_fps: bool = False
     fps: tuple[float, ...] = (30.0,)
     roll: float = 0.3
 
@@ -63,8 +62,7 @@ def _camera(
     pose = look_at_pose(
         position, centre + rng.normal(0.0, placement.aim, 3), rng.uniform(-placement.roll, placement.roll)
     )
-    rates = _MIXED_FPS if placement.mixed_fps else placement.fps
-    fps = float(rates[index % len(rates)])
+    fps = float(placement.fps[index % len(placement.fps)])
     return SimulatedCamera(
         name=f"cam{index}",
         intrinsics=_lens(rng, placement),

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from edge.scenes.common.base import SimulatedScene
-from edge.scenes.common.placement import CameraPlacement, place_cameras
+from edge.scenes.common.placement import MIXED_FPS, CameraPlacement, place_cameras
 from edge.scenes.common.trajectory import SmoothPath, flown_path, hand_waved_path
 from protocols.geometry.types import Floats
 
@@ -23,7 +23,7 @@ _FIELD = CameraPlacement(
     focal=(0.7, 0.95),
     size=(1920, 1080),
     exposure_s=0.004,
-    mixed_fps=True,
+    fps=MIXED_FPS,
 )
 _STREAMS = {"cameras": 0, "path": 1}  # one random stream for each part of a scene; the background has stream 2
 
@@ -79,9 +79,7 @@ class MarkerScene(SimulatedScene):
 def marker_room(seed: int, cameras: int, mixed_fps: bool = False) -> MarkerScene:
     """``marker``: a 4 cm ball waved in a room, seen by VGA cameras on its walls."""
     centre = np.array([0.0, 0.0, 1.3])
-    placement = CameraPlacement(
-        _ROOM.distance, _ROOM.height, _ROOM.aim, _ROOM.focal, _ROOM.size, _ROOM.exposure_s, mixed_fps
-    )
+    placement = replace(_ROOM, fps=MIXED_FPS) if mixed_fps else _ROOM
     return MarkerScene(
         name="marker",
         seed=seed,

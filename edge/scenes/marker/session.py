@@ -69,65 +69,38 @@ def simulate_tracks(
     size_noise: float = 0.01,
     outlier_fraction: float = 0.0,
     drop_fraction: float | None = None,
-    jitter_s: float | None = None,
 ) -> SimulatedTracks:
     """Simulate detections for ``duration_s`` from true time 0; every camera starts at its ``start_s``.
 
     pixel_noise: std of each coordinate [px]; 0.1 is that of the shipped detector. size_noise: relative std of the
-    diameter. outlier_fraction: share of rows at a uniformly random place. drop_fraction, jitter_s: for all cameras, in
-    place of their own. The same arguments give the same detections.
+    diameter. outlier_fraction: share of rows at a uniformly random place. drop_fraction: for all cameras, in place
+    of their own. The same arguments give the same detections.
     """
     tracks = {}
     for index, camera in enumerate(scene.cameras):
         rng = np.random.default_rng([seed, index])
-        tracks[camera.name] = _record(
-            scene,
-            camera,
-            duration_s,
-            rng,
-            pixel_noise,
-            size_noise,
-            outlier_fraction,
-            camera.drop_fraction if drop_fraction is None else drop_fraction,
-            camera.jitter_s if jitter_s is None else jitter_s,
+        count = max(int((duration_s - camera.start_s) * camera.fps * camera.clock.rate), 0)
+        true_time = camera.capture_times(camera.start_s, 0, count, rng)
+        kept = rng.random(count) >= (camera.drop_fraction if drop_fraction is None else drop_fraction)
+        pixels, size = scene.seen_by(camera.name, true_time)
+        pixels = pixels + rng.normal(0.0, pixel_noise, (count, 2))
+        size = size * (1.0 + rng.normal(0.0, size_noise, count))
+        # A ball truncated by the image border is not detected.
+        limit = np.array([camera.intrinsics.width, camera.intrinsics.height]) - 1.0
+        reach = 0.5 * size[:, None]
+        with np.errstate(invalid="ignore"):
+            kept &= ((pixels >= reach) & (pixels <= limit - reach)).all(axis=1)
+        outlier = rng.random(count) < outlier_fraction
+        pixels = np.where(outlier[:, None], rng.uniform(0.0, 1.0, (count, 2)) * limit, pixels)
+        size = np.where(outlier, size * rng.uniform(0.5, 2.0, count), size)
+        seconds = camera.clock.stamps(true_time, rng)
+        tracks[camera.name] = SimulatedTrack(
+            camera=camera.name,
+            frame=np.flatnonzero(kept).astype(np.int64),
+            time=seconds[kept],
+            pixels=pixels[kept],
+            size=size[kept],
+            true_time=true_time[kept],
+            is_outlier=outlier[kept],
         )
     return SimulatedTracks(scene, tracks, 0.0, duration_s)
-
-
-def _record(
-    scene: MarkerScene,
-    camera: SimulatedCamera,
-    duration_s: float,
-    rng: np.random.Generator,
-    pixel_noise: float,
-    size_noise: float,
-    outlier_fraction: float,
-    drop_fraction: float,
-    jitter_s: float,
-) -> SimulatedTrack:
-    count = max(int((duration_s - camera.start_s) * camera.fps * camera.clock.rate), 0)
-    true_time = camera.capture_times(camera.start_s, 0, count, rng, jitter_s)
-    kept = rng.random(count) >= drop_fraction
-    pixels, size = scene.seen_by(camera.name, true_time)
-    pixels = pixels + rng.normal(0.0, pixel_noise, (count, 2))
-    size = size * (1.0 + rng.normal(0.0, size_noise, count))
-    # A ball truncated by the image border is not detected.
-    limit = np.array([camera.intrinsics.width, camera.intrinsics.height]) - 1.0
-    reach = 0.5 * size[:, None]
-    with np.errstate(invalid="ignore"):
-        kept &= ((pixels >= reach) & (pixels <= limit - reach)).all(axis=1)
-    outlier = rng.random(count) < outlier_fraction
-    pixels = np.where(outlier[:, None], rng.uniform(0.0, 1.0, (count, 2)) * limit, pixels)
-    size = np.where(outlier, size * rng.uniform(0.5, 2.0, count), size)
-    stamp = rng.normal(0.0, camera.clock.stamp_noise_s, count)
-    time = np.array([camera.clock.device_time_ns(t) for t in true_time], dtype=np.int64)
-    seconds = (time + np.rint(stamp * NANOSECONDS).astype(np.int64)) / NANOSECONDS
-    return SimulatedTrack(
-        camera=camera.name,
-        frame=np.flatnonzero(kept).astype(np.int64),
-        time=seconds[kept],
-        pixels=pixels[kept],
-        size=size[kept],
-        true_time=true_time[kept],
-        is_outlier=outlier[kept],
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -133,10 +133,7 @@ _SHOES = ((40, 42, 48), (205, 206, 210), (50, 70, 110))  # BGR
 def people_room(seed: int, cameras: int, people: int, mixed_fps: bool = False) -> PeopleScene:
     """The scene ``people`` of a seed; see ``edge.scenes.get_people_scene``."""
     rng = np.random.default_rng([seed, _STREAMS["people"]])
-    placement = _CAMERAS
-    if mixed_fps:
-        fields = {name: getattr(placement, name) for name in placement.__dataclass_fields__}
-        placement = CameraPlacement(**fields | {"fps": _MIXED})
+    placement = replace(_CAMERAS, fps=_MIXED) if mixed_fps else _CAMERAS
     centre = np.array([0.0, 0.0, 0.9])
     placed_cameras = place_cameras(np.random.default_rng([seed, _STREAMS["cameras"]]), centre, cameras, placement)
     tops = rng.permutation(len(_TOPS))

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.scenes.people.scene import PeopleScene
-from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats, Ints
 
 HIDDEN_PX = 3.0
@@ -44,10 +43,29 @@ def simulate_people_tracks(
 
     pixel_noise: std of each coordinate [px]. drop_fraction: share of dropped frames, in place of the cameras' own.
     """
-    return {
-        camera.name: _record(scene, index, duration_s, np.random.default_rng([seed, index]), pixel_noise, drop_fraction)
-        for index, camera in enumerate(scene.cameras)
-    }
+    tracks = {}
+    names = [(f"{one.name}-head", f"{one.name}-foot") for one in scene.people]
+    for index, camera in enumerate(scene.cameras):
+        rng = np.random.default_rng([seed, index])
+        count = max(int((duration_s - camera.start_s) * camera.fps * camera.clock.rate), 0)
+        true_time = camera.capture_times(camera.start_s, 0, count, rng)
+        kept = rng.random(count) >= (camera.drop_fraction if drop_fraction is None else drop_fraction)
+        seconds = camera.clock.stamps(true_time, rng)
+        pixels, visible = visible_points(scene, camera.name, true_time)
+        visible &= kept[:, None, None]
+        size = np.linalg.norm(pixels[:, :, 0] - pixels[:, :, 1], axis=-1)
+        noisy = pixels + rng.normal(0.0, pixel_noise, pixels.shape)
+        frame, person, end = np.nonzero(visible)
+        tracks[camera.name] = PeopleTrack(
+            camera=camera.name,
+            frame=frame.astype(np.int64),
+            time=seconds[frame],
+            pixels=noisy[frame, person, end],
+            size=size[frame, person],
+            label=tuple(names[who][which_end] for who, which_end in zip(person, end, strict=True)),
+            true_time=true_time[frame],
+        )
+    return tracks
 
 
 def visible_points(scene: PeopleScene, camera: str, true_time: Floats) -> tuple[Floats, Bools]:
@@ -70,30 +88,3 @@ def visible_points(scene: PeopleScene, camera: str, true_time: Floats) -> tuple[
             nearer = depth[index].mean(axis=-1)[None, None] < depth[index].mean(axis=-1)[:, None, None]
             visible[index] &= ~(inside & nearer).any(axis=-1)
     return pixels, visible
-
-
-def _record(
-    scene: PeopleScene, which: int, duration_s: float, rng: np.random.Generator, noise: float, drops: float | None
-) -> PeopleTrack:
-    camera = scene.cameras[which]
-    count = max(int((duration_s - camera.start_s) * camera.fps * camera.clock.rate), 0)
-    true_time = camera.capture_times(camera.start_s, 0, count, rng)
-    kept = rng.random(count) >= (camera.drop_fraction if drops is None else drops)
-    stamp = rng.normal(0.0, camera.clock.stamp_noise_s, count)
-    device = np.array([camera.clock.device_time_ns(moment) for moment in true_time], dtype=np.int64)
-    seconds = (device + np.rint(stamp * NANOSECONDS).astype(np.int64)) / NANOSECONDS
-    pixels, visible = visible_points(scene, camera.name, true_time)
-    visible &= kept[:, None, None]
-    size = np.linalg.norm(pixels[:, :, 0] - pixels[:, :, 1], axis=-1)
-    noisy = pixels + rng.normal(0.0, noise, pixels.shape)
-    frame, person, end = np.nonzero(visible)
-    names = [(f"{one.name}-head", f"{one.name}-foot") for one in scene.people]
-    return PeopleTrack(
-        camera=camera.name,
-        frame=frame.astype(np.int64),
-        time=seconds[frame],
-        pixels=noisy[frame, person, end],
-        size=size[frame, person],
-        label=tuple(names[who][which_end] for who, which_end in zip(person, end, strict=True)),
-        true_time=true_time[frame],
-    )

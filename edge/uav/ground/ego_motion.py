@@ -47,7 +47,10 @@ class EgoMotionReport:
 
 
 class EgoMotion:
-    """Tracks the camera from image to image. ``pose`` is the current one."""
+    """Tracks the camera from image to image. ``pose`` is the current one.
+
+    correspondences: pixels (n, 2) of the same ground points in the last working image and in this one.
+    """
 
     def __init__(self, plane: ImagePlane) -> None:
         self._plane = plane
@@ -60,7 +63,7 @@ class EgoMotion:
         self._ground: Floats = np.zeros((0, 2))
         self._bad_frames: npt.NDArray[np.int64] = np.zeros(0, np.int64)
         self._frames_since_detection = 0
-        self._correspondences: tuple[Floats, Floats] = (np.zeros((0, 2)), np.zeros((0, 2)))
+        self.correspondences: tuple[Floats, Floats] = (np.zeros((0, 2)), np.zeros((0, 2)))
         self.frames_without_pose = 0
         """Consecutive frames without a trusted pose."""
 
@@ -127,12 +130,12 @@ class EgoMotion:
         if report.trusted:
             self.pose = found
             self.frames_without_pose = 0
-            self._correspondences = self._pixels[good[2]].astype(np.float64), good[0][good[2]].astype(np.float64)
+            self.correspondences = self._pixels[good[2]].astype(np.float64), good[0][good[2]].astype(np.float64)
             self._update_tracks(good)
         else:
             self.pose = guess
             self.frames_without_pose += 1
-            self._correspondences = np.zeros((0, 2)), np.zeros((0, 2))
+            self.correspondences = np.zeros((0, 2)), np.zeros((0, 2))
             self._drop_tracks()
         self._previous, self._last_dt = previous, dt
         self._frames_since_detection += 1
@@ -144,11 +147,6 @@ class EgoMotion:
     def tracks(self) -> Floats:
         """(n, 2) pixels of the live tracks in the full image, for overlays."""
         return self._to_full(self._pixels.astype(np.float64))
-
-    @property
-    def correspondences(self) -> tuple[Floats, Floats]:
-        """Pixels (n, 2) of the same ground points in the last working image and in this one."""
-        return self._correspondences
 
     def predicted_centre(self, dt: float) -> Floats:
         """The camera centre (3,) extrapolated at constant velocity."""

@@ -48,7 +48,8 @@ class PhotometricGain:
     def corrected(self, image: Image, log_gain: float = 0.0) -> Image:
         """The image (h, w, 3) with the gain removed. log_gain: additional gain to remove, natural logarithm."""
         if abs(log_gain) >= _NEGLIGIBLE_LOG_GAIN:
-            return _divided(image, self.gain * np.exp(log_gain))
+            table = _lookup_table(self.gain * np.exp(log_gain))
+            return np.asarray(cv2.LUT(np.ascontiguousarray(image), table), np.uint8)
         if np.abs(self.gain - 1.0).max() < 0.02:
             return image
         if self._lookup_table is None:
@@ -101,10 +102,6 @@ def contrast_table(image: Image) -> Image | None:
 def _lookup_table(gain: Floats) -> Image:
     levels = np.arange(256)[:, None] / gain
     return np.asarray(np.clip(np.rint(levels), 0, 255), np.uint8)[None]
-
-
-def _divided(image: Image, gain: Floats) -> Image:
-    return np.asarray(cv2.LUT(np.ascontiguousarray(image), _lookup_table(gain)), np.uint8)
 
 
 def _bilinear(image: Image, points: Floats) -> Floats:

@@ -20,26 +20,21 @@ class PlaneCamera(Protocol):
     @property
     def matrix(self) -> Floats:
         """(3, 3), normalised image from ground."""
-        ...
 
     def jacobian(self, ground: Floats, normalised: Floats, depth: Floats) -> Floats:
         """Derivative (n, 2, k) of normalised coordinates by the parameters.
 
         ground: (n, 2) points; normalised: (n, 2) their normalised coordinates; depth: (n,) third coordinates.
         """
-        ...
 
     def retract(self, step: Floats) -> Self:
         """The camera changed by k local parameters."""
-        ...
 
     def extrapolated(self, previous: Self, ratio: float) -> Self:
         """The camera if the motion since ``previous`` continues, times ``ratio``."""
-        ...
 
     def prediction_std(self, seconds: float, scale: float) -> Floats:
         """(k,) std of the extrapolation. scale: typical distance to the ground [ground units]."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,11 +28,9 @@ class Model(Protocol[Observation_contra]):
 
     def propagate(self, states: Floats, rng: np.random.Generator) -> Floats:
         """One draw from p(x_k | x_{k-1}) per particle: (n, d) -> (n, d)."""
-        ...
 
     def log_likelihood(self, states: Floats, observation: Observation_contra) -> Floats:
         """log p(y_k | x_k), up to a constant that is the same for all particles: (n, d) -> (n,)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,10 +53,6 @@ class Particles:
     def reweighted(self, log_likelihoods: Floats) -> Particles:
         """The posterior set: each weight times its likelihood (eq. 2.6), normalised (eq. 2.1)."""
         return Particles(self.states, normalise(self.log_weights + log_likelihoods))
-
-    def resampled(self, rng: np.random.Generator, count: int | None = None) -> Particles:
-        """count particles (default: the same number) of equal weight, drawn in proportion to the weights."""
-        return Particles.uniform(self.states[systematic_resample(self.weights, count or len(self.states), rng)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +188,7 @@ def densest_cluster(points: Floats, weights: Floats, radius: float) -> Cluster:
     around = np.zeros(len(cells))
     for dx in (-1, 0, 1):
         for dy in (-1, 0, 1):
-            wanted = cells + _key_step(dx, dy)
+            wanted = cells + dx * _STRIDES[0] + dy * _STRIDES[1]
             at = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
             around += np.where(cells[at] == wanted, mass[at], 0.0)
     fullest = inverse == int(np.argmax(around + 1e-9 * mass))
@@ -239,7 +233,3 @@ def _keys(index: Ints) -> Ints:
     if index.shape[1] > len(_STRIDES):
         return np.asarray(np.unique(index, axis=0, return_inverse=True)[1], dtype=np.int64).reshape(-1)
     return np.asarray(index @ np.array(_STRIDES[: index.shape[1]], dtype=np.int64), dtype=np.int64)
-
-
-def _key_step(dx: int, dy: int) -> int:
-    return dx * _STRIDES[0] + dy * _STRIDES[1]

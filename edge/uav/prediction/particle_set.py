@@ -54,19 +54,8 @@ class ParticleSet:
 
     def select(self, index: Ints) -> ParticleSet:
         """The particles of an index (m,), of equal weight."""
-        return ParticleSet(
-            self.position[index],
-            self.heading[index],
-            self.speed[index],
-            self.acceleration[index],
-            self.curvature[index],
-            self.path[index],
-            self.arc_length[index],
-            self.lateral_offset[index],
-            self.cruise_speed[index],
-            self.lateral_limit[index],
-            np.full(len(index), 1.0 / len(index)),
-        )
+        chosen = {one.name: getattr(self, one.name)[index] for one in fields(self)}
+        return ParticleSet(**chosen | {"weights": np.full(len(index), 1.0 / len(index))})
 
     def reweighted(self, likelihood: Floats) -> ParticleSet:
         """Background-aware tracking paper, eq. 2.1: weights times likelihoods (n,), normalised."""

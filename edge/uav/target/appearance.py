@@ -6,7 +6,7 @@ evaluated at every cell of the patch at once; maxima of their mean are the candi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -50,10 +50,6 @@ class GroundPatch:
         local = (cells - [(width - 1) / 2.0, (height - 1) / 2.0]) * self.cell_size
         c, s = np.cos(self.angle), np.sin(self.angle)
         return np.asarray(local @ np.array([[c, s], [-s, c]]) + self.centre)
-
-    def with_cells(self, cells: Image) -> GroundPatch:
-        """The same patch with other colours."""
-        return replace(self, cells=cells)
 
     def to_cells(self, ground: Floats) -> Floats:
         """Cell coordinates (n, 2) of ground points (n, 2)."""
@@ -153,7 +149,7 @@ class AppearanceModel:
         self._log_ratio_table: Singles = np.zeros(_BINS**3, np.float32)
         self._template: Singles | None = None
         self._first_template: Singles | None = None
-        self._colour_scale = 1.0
+        self.colour_scale = 1.0
         self._shape_scale = 0.9
 
     def _make_masks(self) -> None:
@@ -258,7 +254,7 @@ class AppearanceModel:
 
     def calibrate(self, colour: float, shape: float, rate: float) -> None:
         """Update the typical colour and shape responses, for which the score is 1."""
-        self._colour_scale = (1 - rate) * self._colour_scale + rate * max(colour, 0.15)
+        self.colour_scale = (1 - rate) * self.colour_scale + rate * max(colour, 0.15)
         self._shape_scale = (1 - rate) * self._shape_scale + rate * max(shape, 0.3)
 
     def log_brightness(self, patch: GroundPatch, centre: Floats) -> float:
@@ -268,11 +264,6 @@ class AppearanceModel:
         cells = cv2.getRectSubPix(patch.cells, (kx, ky), (float(at[0]), float(at[1])))
         levels = np.log(np.maximum(cells.astype(np.float64), 8.0)).mean(axis=2)
         return float((levels * self._target_mask).sum() / float(self._target_mask.sum()))
-
-    @property
-    def colour_scale(self) -> float:
-        """The typical colour response."""
-        return self._colour_scale
 
     def shape_matches(self, candidate: Candidate) -> bool:
         """Whether the shape response is close to the typical one, whatever the colour."""
@@ -298,7 +289,7 @@ class AppearanceModel:
         outer = _correlate(ratio, self._ring_mask) / (ring_total * np.maximum(seen_ring, 0.2))
         colour = inner - 0.5 * outer
         shape = self._shape_response(patch, border)
-        relative_colour = np.clip(colour / self._colour_scale, -0.5, 1.1)
+        relative_colour = np.clip(colour / self.colour_scale, -0.5, 1.1)
         relative_shape = np.clip(shape / self._shape_scale, -0.5, 1.1)
         score = np.where(visible > _MIN_VISIBLE_SHARE, 0.5 * relative_colour + 0.5 * relative_shape, -1.0).astype(
             np.float32

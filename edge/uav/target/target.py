@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -98,7 +100,7 @@ class Target:
         return (
             None
             if patch is None
-            else patch.with_cells(localiser.photometric.corrected(patch.cells, self.local_gain.log_gain))
+            else replace(patch, cells=localiser.photometric.corrected(patch.cells, self.local_gain.log_gain))
         )
 
     def update_resolution(self, position: Floats) -> None:

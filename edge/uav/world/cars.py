@@ -119,8 +119,8 @@ def draw(
         return
     shadow = np.column_stack([_SHADOW, np.zeros(len(_SHADOW))]) @ _yaw_rotation(course).T
     shadow[:, :2] += ground + _SHADOW_SHIFT
-    _fill(image, _project(matrix, shadow), (38, 38, 40))
-    pixels = _project(matrix, _model_at(ground, course))
+    _fill(image, project(matrix, shadow), (38, 38, 40))
+    pixels = project(matrix, _model_at(ground, course))
     both = np.vstack([pixels[_PARTS[0]], pixels[_PARTS[1]]])
     _fill(image, np.asarray(cv2.convexHull(both.astype(np.float32)), np.float64).reshape(-1, 2), _shade(colour, 0.62))
     _fill(image, pixels[_PARTS[1]], _shade(colour, 1.0))
@@ -135,7 +135,8 @@ def _shade(colour: tuple[int, int, int], gain: float) -> tuple[int, int, int]:
     return b, g, r
 
 
-def _project(matrix: Floats, points: Floats) -> Floats:
+def project(matrix: Floats, points: Floats) -> Floats:
+    """Pixels (n, 2) of points (n, 3) NED [m]; matrix: (3, 4) pixels from NED."""
     seen = points @ matrix[:, :3].T + matrix[:, 3]
     return np.asarray(seen[:, :2] / seen[:, 2:])
 

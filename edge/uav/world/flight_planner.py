@@ -100,14 +100,6 @@ class ExitManoeuvre:
     beyond: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SolvedExit:
-    """A flight and its out-of-view frames, begin and end (exclusive): no part of the target is in the image."""
-
-    flight: Flight
-    out_of_view: tuple[int, int]
-
-
 def cosine_ramp(x: Floats) -> Floats:
     """Raised-cosine ramp from 0 to 1 as x goes from 0 to 1."""
     x = np.clip(x, 0.0, 1.0)
@@ -129,9 +121,8 @@ def solve_exit(
     camera: CameraSetup,
     frames: int,
     plan: FlightPlan,
-    levels: DisturbanceLevels | None = None,
-) -> SolvedExit:
-    """The flight with exactly ``frames`` consecutive frames in which the target is out of view.
+) -> tuple[Flight, tuple[int, int]]:
+    """The flight with exactly ``frames`` consecutive frames in which no part of the target is in view, and these.
 
     Bisects the waiting time; where the disturbances make that number impossible, they are redrawn.
     """
@@ -139,9 +130,9 @@ def solve_exit(
     times = grid_times(max_wait + 16.0)
     count = int((times[-1] - 1.0) * FPS)
     target = motion.car(count, (0, 0, 0))
-    best: tuple[int, SolvedExit] | None = None
+    best: tuple[int, Flight, tuple[int, int]] | None = None
     for _ in range(30):
-        disturbance = sample_disturbance(rng, times, levels or DisturbanceLevels())
+        disturbance = sample_disturbance(rng, times, DisturbanceLevels())
         low, high = -1.0, max_wait
         for _ in range(24):
             wait = 0.5 * (low + high)
@@ -150,9 +141,9 @@ def solve_exit(
             length = out[1] - out[0]
             count_error = abs(length - frames) + abs(total - length)
             if best is None or count_error < best[0]:
-                best = count_error, SolvedExit(flight, out)
+                best = count_error, flight, out
             if count_error == 0:
-                return SolvedExit(flight, out)
+                return flight, out
             if total < frames:
                 low = wait
             else:
@@ -160,7 +151,7 @@ def solve_exit(
             if high - low < 1e-3:
                 break
     assert best is not None
-    return best[1]
+    return best[1:]
 
 
 def _out_of_view(camera: CameraSetup, flight: Flight, target: cars.Car) -> tuple[tuple[int, int], int]:
@@ -217,13 +208,12 @@ def follow_target(
     motion: TargetMotion,
     camera: CameraSetup,
     seconds: float,
-    levels: DisturbanceLevels | None = None,
 ) -> Flight:
     """A flight that keeps the target near the image centre."""
     times = grid_times(seconds)
     ground, _ = motion.at(times)
     yaw = np.full(len(times), camera.yaw)
-    disturbance = sample_disturbance(rng, times, levels or DisturbanceLevels())
+    disturbance = sample_disturbance(rng, times, DisturbanceLevels())
     return flight_over(times, ground + camera.offset, yaw, camera.altitude, disturbance, camera.body_from_camera)
 
 

@@ -136,11 +136,11 @@ class FlightWorld:
         ground, course = self.target.ground[i], float(self.target.course[i])
         centre = np.array([ground[0], ground[1], -cars.CENTRE_HEIGHT])
         ahead = centre + _HEADING_BASELINE * np.array([np.cos(course), np.sin(course), 0.0])
-        (x, y), (x2, y2) = _project(matrix, np.array([centre, ahead]))
-        corner = _project(matrix, cars.hull_points(ground, course))
+        (x, y), (x2, y2) = cars.project(matrix, np.array([centre, ahead]))
+        corner = cars.project(matrix, cars.hull_points(ground, course))
         width, height = corner.max(axis=0) - corner.min(axis=0)
         points = cars.body_points(ground, course)
-        inside = _in_image(self.lens, _project(matrix, points))
+        inside = _in_image(self.lens, cars.project(matrix, points))
         seen = inside & ~self.town.occluders.occluded(position, points) if inside.any() else inside
         before, after = max(i - 1, 0), min(i + 1, self.length - 1)
         step = self.target.ground[after] - self.target.ground[before]
@@ -228,11 +228,11 @@ class FlightWorld:
         placements += [(car.ground[0], float(car.course[0])) for car in self.town.parked]
         out = []
         for ground, course in placements:
-            pixel = _project(matrix, np.array([[ground[0], ground[1], -cars.CENTRE_HEIGHT]]))[0]
+            pixel = cars.project(matrix, np.array([[ground[0], ground[1], -cars.CENTRE_HEIGHT]]))[0]
             if not (-50 < pixel[0] < self.lens.width + 50 and -50 < pixel[1] < self.lens.height + 50):
                 continue
             points = cars.body_points(ground, course)
-            seen = _in_image(self.lens, _project(matrix, points))
+            seen = _in_image(self.lens, cars.project(matrix, points))
             seen &= ~self.town.occluders.occluded(position, points)
             if seen.mean() > _MIN_VISIBLE_SHARE:
                 out.append(pixel)
@@ -262,11 +262,6 @@ def longest_run(mask: npt.NDArray[np.bool_]) -> tuple[int, int]:
         return 0, 0
     k = int(np.argmax(ends - begins))
     return int(begins[k]), int(ends[k])
-
-
-def _project(matrix: Floats, points: Floats) -> Floats:
-    seen = points @ matrix[:, :3].T + matrix[:, 3]
-    return np.asarray(seen[:, :2] / seen[:, 2:])
 
 
 def _in_image(lens: Intrinsics, pixels: Floats) -> npt.NDArray[np.bool_]:

@@ -30,24 +30,19 @@ class Occluder(Protocol):
     @property
     def centre(self) -> Floats:
         """North, east [m]."""
-        ...
 
     @property
     def bounding_radius(self) -> float:
         """Radius of a bounding circle about the centre on the ground [m]."""
-        ...
 
     def draw(self, image: Image, matrix: Floats) -> None:
         """Draw into ``image``; matrix: (3, 4) pixels from NED."""
-        ...
 
     def occludes(self, camera: Floats, points: Floats) -> Bools:
         """Which of points (n, 3) NED this object occludes for a camera at (3,) NED."""
-        ...
 
     def shadow(self) -> Floats:
         """Outline (k, 2) of its shadow on the ground [m]."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,6 +148,3 @@ def _traffic(rng: np.random.Generator, path: Curve, frames: Floats, not_colour: 
         ground, course = route.at(frames, 0.5 * LANE)
         out.append(cars.Car(ground, course, cars.COLOURS_BGR[colours[int(rng.integers(len(colours)))]]))
     return tuple(out)
-
-
-__all__ = ["NAME", "ClosedRoute", "block_route", "patrol_world"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from edge.uav.world import cars
@@ -70,8 +72,8 @@ def distractors(inputs: ScenarioInputs) -> ScenarioPlan:
     angle = rng.choice([-1.0, 1.0]) * rng.uniform(0.0, np.deg2rad(40.0))
     roads = main_road(inputs, [Bend(rng.uniform(-5.0, 20.0), angle, rng.uniform(40.0, 70.0))], crossing=False)
     plan = exit_scenario(inputs, roads, right_lane(roads[0]), any_direction(rng))
-    motion, n = plan.motion, plan.length
-    times = np.arange(n) / FPS
+    motion = plan.motion
+    times = np.arange(plan.length) / FPS
     behind, ahead = rng.uniform(1.4, 2.3), -rng.uniform(1.6, 2.8)
     lookalikes = []
     for meet in (rng.uniform(0.3, 0.7), rng.uniform(0.8, 1.1)):  # shares of the out-of-view time
@@ -82,16 +84,7 @@ def distractors(inputs: ScenarioInputs) -> ScenarioPlan:
         lookalikes.append(cars.Car(ground, course + np.pi, inputs.bgr))
     if np.linalg.norm(lookalikes[0].ground - lookalikes[1].ground, axis=1).min() < 9.0:
         lookalikes.pop()
-    return ScenarioPlan(
-        plan.camera,
-        roads,
-        motion,
-        plan.flight,
-        n,
-        lookalike_delays_s=(behind, ahead),
-        lookalikes=tuple(lookalikes),
-        other_traffic_tries=1,
-    )
+    return replace(plan, lookalike_delays_s=(behind, ahead), lookalikes=tuple(lookalikes), other_traffic_tries=1)
 
 
 def town(inputs: ScenarioInputs) -> ScenarioPlan:
@@ -101,7 +94,7 @@ def town(inputs: ScenarioInputs) -> ScenarioPlan:
     plan = exit_scenario(
         inputs, roads, path, _drift_direction(rng, inputs.course, angle), yaw_change=rng.uniform(-0.7, 0.7)
     )
-    return ScenarioPlan(plan.camera, roads, plan.motion, plan.flight, plan.length, other_traffic_tries=9)
+    return replace(plan, other_traffic_tries=9)
 
 
 def exit_scenario(
@@ -123,8 +116,8 @@ def any_direction(rng: np.random.Generator) -> Floats:
 
 
 def _solved_scenario(inputs: ScenarioInputs, roads: list[Road], motion: TargetMotion, plan: FlightPlan) -> ScenarioPlan:
-    solved = solve_exit(inputs.rng, motion, inputs.camera, inputs.frames, plan)
-    return ScenarioPlan(inputs.camera, roads, motion, solved.flight, solved.out_of_view[1] + _TAIL_FRAMES)
+    flight, out_of_view = solve_exit(inputs.rng, motion, inputs.camera, inputs.frames, plan)
+    return ScenarioPlan(inputs.camera, roads, motion, flight, out_of_view[1] + _TAIL_FRAMES)
 
 
 def _drift_direction(rng: np.random.Generator, course: float, angle: float) -> Floats:

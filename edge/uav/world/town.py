@@ -39,6 +39,8 @@ class _DistanceMap:
             cells = np.rint((curve.points - self._origin) / _CELL).astype(np.int32)
             cv2.polylines(free, [cells[:, ::-1].reshape(-1, 1, 2)], False, 0, 1)
         self._map = np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5)) * _CELL
+        if not curves:
+            self._map[:] = np.inf
 
     def at(self, points: Floats) -> Floats:
         cells = np.rint((points - self._origin) / _CELL).astype(int)
@@ -63,92 +65,76 @@ def build_town(
     not_colour: a colour that no parked car has. parked_share: occupied share of the parking places.
     sight_lines: pairs of a camera (3,) and points of a car (n, 3) NED that no building or tree may occlude.
     """
-    road_distance = _DistanceMap(area, [road.centre for road in roads])
-    clearance = _DistanceMap(area, keep_clear) if keep_clear else None
-    houses = _buildings(rng, area, roads, road_distance, clearance, scenario_occluders)
-    trees = _trees(rng, area, houses, road_distance, clearance)
+    place = _Placement(
+        rng, area, roads, _DistanceMap(area, [road.centre for road in roads]), _DistanceMap(area, keep_clear)
+    )
+    houses = place.buildings(scenario_occluders)
+    trees = place.trees(houses)
     houses = [house for house in houses if not _blocks_view(house, sight_lines)]
     trees = [tree for tree in trees if not _blocks_view(tree, sight_lines)]
-    parked = _parked(rng, area, roads, clearance, not_colour, parked_share)
+    parked = place.parked(not_colour, parked_share)
     yards = [_yard(house) for house in houses if rng.random() < 0.7]
     everything: list[Occluder] = [*houses, *scenario_occluders, *trees]
     ground = paint_ground(rng, area, roads, yards, [occluder.shadow() for occluder in everything])
     return Town(ground, Occluders.of(everything), tuple(parked))
 
 
-def _buildings(
-    rng: np.random.Generator,
-    area: Area,
-    roads: Sequence[Road],
-    road_distance: _DistanceMap,
-    clearance: _DistanceMap | None,
-    scenario_occluders: Sequence[Occluder],
-) -> list[occluders.Building]:
-    out: list[occluders.Building] = []
-    for _ in range(int(area.size / 110.0)):
-        if len(out) >= area.size / 620.0:
-            break
-        centre = np.array([rng.uniform(*area.north), rng.uniform(*area.east)])
-        length, width = rng.uniform(8.0, 17.0), rng.uniform(7.0, 11.0)
-        bounding_radius = 0.5 * float(np.hypot(length, width))
-        free = float(road_distance.at(centre[None])[0])
-        if not bounding_radius + 5.5 < free < 40.0 or (
-            clearance is not None and clearance.at(centre[None])[0] < bounding_radius + 7.0
-        ):
-            continue
-        if any(
-            np.linalg.norm(centre - other.centre) < bounding_radius + other.bounding_radius + 2.0
-            for other in (*out, *scenario_occluders)
-        ):
-            continue
-        out.append(occluders.random_building(rng, centre, _along(roads, centre), length, width, rng.uniform(3.0, 8.0)))
-    return out
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placement:
+    """Places objects at random, none too near to a road or to what has to stay clear."""
 
+    rng: np.random.Generator
+    area: Area
+    roads: Sequence[Road]
+    road_distance: _DistanceMap
+    clearance: _DistanceMap
 
-def _trees(
-    rng: np.random.Generator,
-    area: Area,
-    houses: Sequence[occluders.Building],
-    road_distance: _DistanceMap,
-    clearance: _DistanceMap | None,
-) -> list[occluders.FlatOccluder]:
-    out: list[occluders.FlatOccluder] = []
-    for _ in range(int(area.size / 170.0)):
-        centre = np.array([rng.uniform(*area.north), rng.uniform(*area.east)])
-        radius = rng.uniform(1.4, 3.3)
-        if road_distance.at(centre[None])[0] < radius + 6.3 or (
-            clearance is not None and clearance.at(centre[None])[0] < radius + 4.0
-        ):
-            continue
-        if any(np.linalg.norm(centre - house.centre) < 0.7 * house.bounding_radius + radius for house in houses):
-            continue
-        out.append(occluders.random_canopy(rng, centre, radius, rng.uniform(3.0, 5.5)))
-    return sorted(out, key=lambda tree: tree.height)
+    def buildings(self, others: Sequence[Occluder]) -> list[occluders.Building]:
+        rng, out = self.rng, list[occluders.Building]()
+        for _ in range(int(self.area.size / 110.0)):
+            if len(out) >= self.area.size / 620.0:
+                break
+            centre = np.array([rng.uniform(*self.area.north), rng.uniform(*self.area.east)])
+            length, width = rng.uniform(8.0, 17.0), rng.uniform(7.0, 11.0)
+            radius = 0.5 * float(np.hypot(length, width))
+            free = float(self.road_distance.at(centre[None])[0])
+            if not radius + 5.5 < free < 40.0 or self.clearance.at(centre[None])[0] < radius + 7.0:
+                continue
+            if any(np.linalg.norm(centre - o.centre) < radius + o.bounding_radius + 2.0 for o in (*out, *others)):
+                continue
+            course = _along(self.roads, centre)
+            out.append(occluders.random_building(rng, centre, course, length, width, rng.uniform(3.0, 8.0)))
+        return out
 
+    def trees(self, houses: Sequence[occluders.Building]) -> list[occluders.FlatOccluder]:
+        rng, out = self.rng, list[occluders.FlatOccluder]()
+        for _ in range(int(self.area.size / 170.0)):
+            centre = np.array([rng.uniform(*self.area.north), rng.uniform(*self.area.east)])
+            radius = rng.uniform(1.4, 3.3)
+            at = centre[None]
+            if self.road_distance.at(at)[0] < radius + 6.3 or self.clearance.at(at)[0] < radius + 4.0:
+                continue
+            if any(np.linalg.norm(centre - house.centre) < 0.7 * house.bounding_radius + radius for house in houses):
+                continue
+            out.append(occluders.random_canopy(rng, centre, radius, rng.uniform(3.0, 5.5)))
+        return sorted(out, key=lambda tree: tree.height)
 
-def _parked(
-    rng: np.random.Generator,
-    area: Area,
-    roads: Sequence[Road],
-    clearance: _DistanceMap | None,
-    not_colour: str,
-    share: float,
-) -> list[Car]:
-    names = [name for name in COLOURS_BGR if name != not_colour]
-    out: list[Car] = []
-    for number, road in enumerate(roads):
-        crossing = [other.centre for k, other in enumerate(roads) if k != number]
-        for s in np.arange(road.centre.begin + 5.0, road.centre.end - 5.0, 7.5):
-            for side in (-1.0, 1.0):
-                if rng.random() > share:
-                    continue
-                place, course = road.centre.at(np.array([s + rng.uniform(-0.8, 0.8)]), side * _PARKING_OFFSET)
-                near = any(other.distance(place)[0] < 11.0 for other in crossing)
-                if near or not area.contains(place)[0] or (clearance is not None and clearance.at(place)[0] < 5.0):
-                    continue
-                turned = course + rng.normal(0.0, 0.03) + (np.pi if side < 0 else 0.0)
-                out.append(Car(place, turned, COLOURS_BGR[names[int(rng.integers(len(names)))]]))
-    return out
+    def parked(self, not_colour: str, share: float) -> list[Car]:
+        names = [name for name in COLOURS_BGR if name != not_colour]
+        rng, out = self.rng, list[Car]()
+        for number, road in enumerate(self.roads):
+            crossing = [other.centre for k, other in enumerate(self.roads) if k != number]
+            for s in np.arange(road.centre.begin + 5.0, road.centre.end - 5.0, 7.5):
+                for side in (-1.0, 1.0):
+                    if rng.random() > share:
+                        continue
+                    place, course = road.centre.at(np.array([s + rng.uniform(-0.8, 0.8)]), side * _PARKING_OFFSET)
+                    near = any(other.distance(place)[0] < 11.0 for other in crossing)
+                    if near or not self.area.contains(place)[0] or self.clearance.at(place)[0] < 5.0:
+                        continue
+                    turned = course + rng.normal(0.0, 0.03) + (np.pi if side < 0 else 0.0)
+                    out.append(Car(place, turned, COLOURS_BGR[names[int(rng.integers(len(names)))]]))
+        return out
 
 
 def _blocks_view(occluder: Occluder, sight_lines: Sequence[tuple[Floats, Floats]]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from collections import Counter
@@ -16,6 +15,7 @@ from mcap.reader import make_reader
 
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
+from protocols.core.files import completed_file
 from protocols.log.read.reader import LogReader
 from protocols.log.schemas import is_foxglove, schema_of
 from protocols.log.write.writer import LogWriter
@@ -62,19 +62,13 @@ def recover(path: Path, out: Path) -> Recovery:
     times and numbers. Raises InputError (no log, ``out`` exists, disk full) and Refused (no complete message).
     """
     reader = LogReader(path)
-    if out.exists():
-        raise InputError("exists already", file=out, remedy="choose another --out, or move it away")
-    temporary = out.with_name(f".{out.name}.{os.getpid()}")
     try:
-        recovery = _copy(reader, temporary, out)
-        temporary.replace(out)
+        with completed_file(out, new=True) as temporary:
+            return _copy(reader, temporary, out)
     except OSError as error:
         raise InputError(
             f"cannot be written: {error.strerror or error}", file=out, remedy="choose another --out"
         ) from None
-    finally:
-        temporary.unlink(missing_ok=True)
-    return recovery
 
 
 def _copy(reader: LogReader, temporary: Path, out: Path) -> Recovery:

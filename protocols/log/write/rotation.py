@@ -33,7 +33,7 @@ class RotatingWriter(Closing):
         max_s: float | None = None,
         views: bool = False,
     ) -> None:
-        self.path = path
+        self._base = path
         self._metadata = metadata
         self._session = session
         self._max_bytes = max_bytes
@@ -60,7 +60,7 @@ class RotatingWriter(Closing):
         return self._number + 1
 
     @property
-    def current(self) -> Path:
+    def path(self) -> Path:
         """The file that is being written."""
         return self._writer.path
 
@@ -102,7 +102,7 @@ class RotatingWriter(Closing):
 
     def _open(self) -> LogWriter:
         return LogWriter(
-            part_path(self.path, self._number),
+            part_path(self._base, self._number),
             self._metadata,
             part=(self._session, self._number),
             views=self._views,

@@ -86,11 +86,6 @@ class LogWriter(Closing):
                 self._writer.add_metadata(name, dict(values))
 
     @property
-    def current(self) -> Path:
-        """The file that is being written."""
-        return self.path
-
-    @property
     def size(self) -> int:
         """Bytes in the file so far."""
         return self._file.tell()
