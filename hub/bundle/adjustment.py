@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
-from hub.bundle.bordered_system import solve
+from hub.bundle.bordered_system import complement, solve
 from hub.bundle.normal_equations import assemble, weigh_residuals
 from hub.bundle.problem import (
     ASPECT,
@@ -148,13 +148,16 @@ def _reject_single_views(parts: list[TrackObservations], state: AdjustmentState)
 
 
 def gauge_tangent(problem: Problem, state: AdjustmentState) -> Floats | None:
-    """Orthonormal directions (p, q) in which the free camera parameters may move with the gauge fixed.
+    """Orthonormal directions (p, p - 7) in which the free camera parameters may move: perpendicular to `gauge`."""
+    fixed = gauge(problem, state)
+    return None if fixed is None else complement(fixed)
 
-    Fixed: pose of the first anchor, distance between the two anchors. None where poses are not free.
-    """
+
+def gauge(problem: Problem, state: AdjustmentState) -> Floats | None:
+    """Orthonormal directions (7, p) in which the free camera parameters do not move: the pose of the first anchor and
+    the distance between the two anchors. None where poses are not free."""
     if not problem.free_parameters.pose:
         return None
-    columns = problem.free_columns()
     first, second = problem.anchors
     width = len(state.cameras) * CAMERA_PARAMETERS
     constraints = np.zeros((7, width))
@@ -162,8 +165,7 @@ def gauge_tangent(problem: Problem, state: AdjustmentState) -> Floats | None:
     baseline = state.cameras[second].pose.position - state.cameras[first].pose.position
     baseline = baseline / np.linalg.norm(baseline)
     constraints[6, second * CAMERA_PARAMETERS + 3 : second * CAMERA_PARAMETERS + 6] = baseline
-    _, _, vt = np.linalg.svd(constraints[:, columns])
-    return np.asarray(vt[7:].T)
+    return constraints[:, problem.free_columns()]
 
 
 def apply_step(problem: Problem, state: AdjustmentState, path_step: Floats, camera_step: Floats) -> AdjustmentState:
@@ -239,7 +241,7 @@ def _minimise(
     for _ in range(iterations):
         system = system or assemble(problem, state, prior, current)
         try:
-            path_step, camera_step = solve(system, damping, gauge_tangent(problem, state))
+            path_step, camera_step = solve(system, damping, gauge(problem, state))
         except np.linalg.LinAlgError:
             damping *= 10.0
             continue

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erf
 
-from hub.bundle.bordered_system import BAND, eliminate, regularisation
+from hub.bundle.bordered_system import BAND, PathByCameras, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
@@ -26,12 +26,12 @@ _HALVINGS = 24  # of the interval: to 1e-7 of its width
 class Covariance:
     """Joint covariance of all camera parameters, and the blocks needed for that of the path.
 
-    cameras: (18 n, 18 n), zero where a parameter is fixed. carried: (3 m, p) A⁻¹ B over the free columns.
+    cameras: (18 n, 18 n), zero where a parameter is fixed. a_inv_b: (3 m, p) A⁻¹ B over the free columns.
     free: (p, p) covariance of the free columns. blocks: (k, 24, 24) blocks of A⁻¹ about the diagonal.
     """
 
     cameras: Floats
-    a_inv_b: Floats
+    a_inv_b: PathByCameras
     free: Floats
     blocks: Floats
 
@@ -157,7 +157,7 @@ def time_map_std(cov: Covariance, state: AdjustmentState, camera: int, reference
     return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / base.rate)
 
 
-def inner_constraints(a_inv_b: Floats, state: AdjustmentState, datum_points: list[tuple[int, Floats]]) -> Floats:
+def inner_constraints(a_inv_b: PathByCameras, state: AdjustmentState, datum_points: list[tuple[int, Floats]]) -> Floats:
     """(7, p) constraints over the free columns: the similarity fitted to the datum points does not move.
 
     The trajectory follows the cameras by -A^-1 B; the points' own noise averages out over many of them.
@@ -165,19 +165,20 @@ def inner_constraints(a_inv_b: Floats, state: AdjustmentState, datum_points: lis
     generators, jacobian = [], []
     for label, time in datum_points:
         path = state.trajectories[label]
-        base = 3 * sum(before.basis.size for before in state.trajectories[:label])
         index, weights, _ = path.basis.weights(time)
-        rows = base + 3 * (index[:, None] + np.arange(weights.shape[1]))
-        control = a_inv_b[rows[:, :, None] + np.arange(3)]
-        jacobian.append(-np.einsum("na,naip->nip", weights, control).reshape(-1, a_inv_b.shape[1]))
+        _, columns, part = a_inv_b.parts[label]
+        control = part[3 * (index[:, None] + np.arange(weights.shape[1]))[:, :, None] + np.arange(3)]
+        moved = np.zeros((3 * len(time), a_inv_b.width))
+        moved[:, columns] = -np.einsum("na,naip->nip", weights, control).reshape(len(moved), len(columns))
+        jacobian.append(moved)
         points = path.at(time)
         block = np.zeros((len(points), 3, 7))
         block[:, :, :3] = np.eye(3)
         block[:, :, 3:6] = -np.array([so3.hat(point) for point in points])
         block[:, :, 6] = points
         generators.append(block.reshape(-1, 7))
-    columns = np.concatenate(generators)
-    found = np.linalg.lstsq(columns / np.linalg.norm(columns, axis=0), np.concatenate(jacobian), rcond=None)[0]
+    along = np.concatenate(generators)
+    found = np.linalg.lstsq(along / np.linalg.norm(along, axis=0), np.concatenate(jacobian), rcond=None)[0]
     return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
@@ -236,9 +237,10 @@ def position_std(cov: Covariance, camera: int) -> Floats:
 
 def path_std(cov: Covariance, state: AdjustmentState, label: int, time: Floats) -> Floats:
     """Std (n,) of a path at internal reference times (n,): one for three axes, see `equivalent_std`."""
-    base = 3 * sum(path.basis.size for path in state.trajectories[:label])
     index, weights, _ = state.trajectories[label].basis.weights(time)
-    first = base + 3 * index
+    rows, columns, by_cameras = cov.a_inv_b.parts[label]
+    free = cov.free[np.ix_(columns, columns)]
+    first = rows.start + 3 * index
     block, inside = first // BAND, first % BAND
     out = np.zeros((len(time), 3))
     for axis in range(3):
@@ -246,9 +248,8 @@ def path_std(cov: Covariance, state: AdjustmentState, label: int, time: Floats) 
             for b in range(SUPPORT):
                 values = cov.blocks[block, inside + 3 * a + axis, inside + 3 * b + axis]
                 out[:, axis] += weights[:, a] * weights[:, b] * values
-        sensitivity = cov.a_inv_b[base + axis : base + 3 * state.trajectories[label].basis.size : 3]
-        a_inv_b = weighted_sums(sensitivity, index, weights)
-        out[:, axis] += ((a_inv_b @ cov.free) * a_inv_b).sum(axis=1)
+        a_inv_b = weighted_sums(by_cameras[axis::3], index, weights)
+        out[:, axis] += ((a_inv_b @ free) * a_inv_b).sum(axis=1)
     return equivalent_std(np.sqrt(np.maximum(out, 0.0)))
 
 

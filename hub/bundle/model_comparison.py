@@ -206,7 +206,7 @@ def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessP
     """Free columns (p,), normal matrix (p, p) and gradient (p,) of the camera parameters, the paths eliminated."""
     system, _ = build_system(problem, state, prior, robust=False)
     parts = eliminate(system)
-    gradient = system.gradient_cameras - system.border.T @ cho_solve_path(parts, system.gradient_path)
+    gradient = system.gradient_cameras - system.border.transposed_times(cho_solve_path(parts, system.gradient_path))
     return problem.free_columns(), parts.reduced, gradient
 
 
@@ -353,7 +353,8 @@ class _Linearised:
         tangent = gauge_tangent(wide, state)
         directions: Floats = np.eye(len(system.gradient_cameras)) if tangent is None else tangent
         covariance = directions @ np.linalg.solve(directions.T @ parts.reduced @ directions, directions.T)
-        return cls(wide, noisy, system, parts, path, system.gradient_cameras - system.border.T @ path, covariance)
+        gradient = system.gradient_cameras - system.border.transposed_times(path)
+        return cls(wide, noisy, system, parts, path, gradient, covariance)
 
     def best_step(self, camera: int, times: Floats) -> tuple[ClockStep, Floats, Floats]:
         """The best of a camera's steps at camera times (k,); what the paths (m,) and the cameras (p,) do with it."""
@@ -374,7 +375,7 @@ class _Linearised:
         corner = np.zeros((len(columns), len(times)))
         corner[mine] = cross[4:] @ after.T
         solved = cho_solve_banded(self.parts.factor, border)
-        coupling = corner - system.border.T @ solved
+        coupling = corner - system.border.transposed_times(solved)
         score = after @ (weighted * seen.residual).sum(axis=0) - solved.T @ system.gradient_path
         score -= coupling.T @ (self.covariance @ self.gradient)
         information = after @ cross[3] - (border * solved).sum(axis=0)
