@@ -88,13 +88,12 @@ def estimate_noise(problem: Problem, state: AdjustmentState) -> Floats:
     sigma = state.sigma.copy()
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return np.full(len(sigma), _pooled_noise(problem, state))
-    for camera in range(len(state.cameras)):
-        parts = [
-            residual_norms(rows, state.cameras[camera], state.trajectories[rows.label])[rows.use]
-            for rows in problem.rows
-            if rows.camera == camera
-        ]
-        values = np.concatenate(parts) if parts else np.zeros(0)
+    by_camera: dict[int, list[Floats]] = {}
+    for rows in problem.rows:
+        norms = residual_norms(rows, state.cameras[rows.camera], state.trajectories[rows.label])
+        by_camera.setdefault(rows.camera, []).append(norms[rows.use])
+    for camera, parts in by_camera.items():
+        values = np.concatenate(parts)
         values = values[np.isfinite(values)]
         if len(values) >= 8:
             sigma[camera] = max(_MIN_SIGMA_PX, float(np.median(values)) / 1.1774)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,14 +102,14 @@ def relative_rotation_stds(cameras: Floats, state: AdjustmentState) -> Floats:
     """
     count = len(state.cameras)
     out = np.zeros((count, count))
-    for i in range(count):
-        for j in range(i):
-            at = np.r_[i * CAMERA_PARAMETERS : i * CAMERA_PARAMETERS + 3]
-            to = np.r_[j * CAMERA_PARAMETERS : j * CAMERA_PARAMETERS + 3]
-            relative = state.cameras[i].pose.rotation @ state.cameras[j].pose.rotation.T
-            cross = cameras[np.ix_(at, to)] @ relative.T
-            between = cameras[np.ix_(at, at)] + relative @ cameras[np.ix_(to, to)] @ relative.T - cross - cross.T
-            out[i, j] = out[j, i] = float(np.sqrt(max(np.linalg.eigvalsh(between)[-1], 0.0)))
+    blocks = cameras.reshape(count, CAMERA_PARAMETERS, count, CAMERA_PARAMETERS)[:, :3, :, :3].transpose(0, 2, 1, 3)
+    own = np.array([blocks[i, i] for i in range(count)])
+    turned = np.array([camera.pose.rotation.T for camera in state.cameras])
+    for i in range(1, count):
+        relative = state.cameras[i].pose.rotation @ turned[:i]
+        cross = blocks[i, :i] @ relative.transpose(0, 2, 1)
+        between = own[i] + relative @ own[:i] @ relative.transpose(0, 2, 1) - cross - cross.transpose(0, 2, 1)
+        out[i, :i] = out[:i, i] = np.sqrt(np.maximum(np.linalg.eigvalsh(between)[:, -1], 0.0))
     return out
 
 
@@ -197,24 +196,24 @@ def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentStat
     span: in the middle of the gap. Diagonal 0.
     """
     count, spans = len(state.cameras), _observed_spans(problem, state)
+    shape = (count, CAMERA_PARAMETERS) * 2
+    blocks = cov.cameras.reshape(shape)[:, OFFSET : RATE + 1, :, OFFSET : RATE + 1]
+    own = np.array([blocks[i, :, i] for i in range(count)])
+    offsets, rates = (np.array([getattr(camera, name) for camera in state.cameras]) for name in ("offset", "rate"))
     out = np.zeros((count, count))
-    for i, j in itertools.combinations(range(count), 2):
-        middle = _middle(spans[[i, j]])
-        of_rates = [(middle - now.offset) / now.rate for now in (state.cameras[i], state.cameras[j])]
-        row = np.array([1.0, of_rates[0], -1.0, -of_rates[1]])
-        columns = [camera * CAMERA_PARAMETERS + parameter for camera in (i, j) for parameter in (OFFSET, RATE)]
-        out[i, j] = out[j, i] = np.sqrt(max(float(row @ cov.cameras[np.ix_(columns, columns)] @ row), 0.0))
+    for i in range(1, count):
+        middle = 0.5 * (np.maximum(spans[:i, 0], spans[i, 0]) + np.minimum(spans[:i, 1], spans[i, 1]))
+        mine, theirs = (np.stack([np.ones(i), (middle - offsets[k]) / rates[k]]) for k in (i, slice(i)))
+        variance = (mine * (own[i] @ mine)).sum(axis=0) + np.einsum("aj,jab,bj->j", theirs, own[:i], theirs)
+        variance -= 2.0 * np.einsum("aj,ajb,bj->j", mine, blocks[i, :, :i], theirs)
+        out[i, :i] = out[:i, i] = np.sqrt(np.maximum(variance, 0.0))
     return out
 
 
 def middle_of_overlap(problem: Problem, state: AdjustmentState, first: int, second: int) -> Floats:
     """Internal reference time (1,) in the middle of the common span of two cameras, or of the gap between them."""
-    return np.array([_middle(_observed_spans(problem, state)[[first, second]])])
-
-
-def _middle(spans: Floats) -> float:
-    """Of what spans (2, 2) have in common, or of the gap between them."""
-    return float(0.5 * (spans[:, 0].max() + spans[:, 1].min()))
+    spans = _observed_spans(problem, state)[[first, second]]
+    return np.array([0.5 * (spans[:, 0].max() + spans[:, 1].min())])
 
 
 def _observed_spans(problem: Problem, state: AdjustmentState) -> Floats:
