@@ -211,11 +211,6 @@ def eliminate(system: BorderedSystem, damping: float = 0.0) -> Elimination:
     return Elimination(factor, replace(system.border, parts=tuple(parts)), np.asarray(0.5 * (reduced + reduced.T)))
 
 
-def cho_solve_path(parts: Elimination, rhs: Floats) -> Floats:
-    """A⁻¹ right, (3 n,) of (3 n,)."""
-    return cho_solve_banded(parts.factor, rhs)
-
-
 def solve(system: BorderedSystem, damping: float, fixed: Floats | None) -> tuple[Floats, Floats]:
     """Levenberg-Marquardt step (path (3 n,), cameras (p,)). Raises LinAlgError.
 

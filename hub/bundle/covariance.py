@@ -195,35 +195,26 @@ def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentStat
     That is where their lag is used; away from it the uncertain rates increase the std. For cameras without a common
     span: in the middle of the gap. Diagonal 0.
     """
-    count, spans = len(state.cameras), _observed_spans(problem, state)
-    shape = (count, CAMERA_PARAMETERS) * 2
-    blocks = cov.cameras.reshape(shape)[:, OFFSET : RATE + 1, :, OFFSET : RATE + 1]
-    own = np.array([blocks[i, :, i] for i in range(count)])
+    middle = middles_of_overlap(problem, state)
     offsets, rates = (np.array([getattr(camera, name) for camera in state.cameras]) for name in ("offset", "rate"))
-    out = np.zeros((count, count))
-    for i in range(1, count):
-        middle = 0.5 * (np.maximum(spans[:i, 0], spans[i, 0]) + np.minimum(spans[:i, 1], spans[i, 1]))
-        mine, theirs = (np.stack([np.ones(i), (middle - offsets[k]) / rates[k]]) for k in (i, slice(i)))
-        variance = (mine * (own[i] @ mine)).sum(axis=0) + np.einsum("aj,jab,bj->j", theirs, own[:i], theirs)
-        variance -= 2.0 * np.einsum("aj,ajb,bj->j", mine, blocks[i, :, :i], theirs)
-        out[i, :i] = out[:i, i] = np.sqrt(np.maximum(variance, 0.0))
-    return out
+    change = (middle - offsets[:, None]) / rates[:, None]  # of a camera's (first index) map by its rate
+    both = ((OFFSET, OFFSET), (RATE, OFFSET), (RATE, RATE))
+    offset, mixed, rate = (cov.cameras[a::CAMERA_PARAMETERS, b::CAMERA_PARAMETERS] for a, b in both)
+    own = np.diag(offset)[:, None] + 2.0 * change * np.diag(mixed)[:, None] + change**2 * np.diag(rate)[:, None]
+    shared = offset + change * mixed + change.T * mixed.T + change * change.T * rate
+    variance = own + own.T - 2.0 * shared
+    np.fill_diagonal(variance, 0.0)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def middle_of_overlap(problem: Problem, state: AdjustmentState, first: int, second: int) -> Floats:
-    """Internal reference time (1,) in the middle of the common span of two cameras, or of the gap between them."""
-    spans = _observed_spans(problem, state)[[first, second]]
-    return np.array([0.5 * (spans[:, 0].max() + spans[:, 1].min())])
-
-
-def _observed_spans(problem: Problem, state: AdjustmentState) -> Floats:
-    """First and last internal reference time (cameras, 2) of each camera's rows."""
-    out = np.tile([np.inf, -np.inf], (len(state.cameras), 1))
+def middles_of_overlap(problem: Problem, state: AdjustmentState) -> Floats:
+    """Internal reference time (cameras, cameras) in the middle of the common span of two, or of the gap between."""
+    first, last = np.full(len(state.cameras), np.inf), np.full(len(state.cameras), -np.inf)
     for part in problem.rows:
-        if len(part.time):
-            times = state.cameras[part.camera].reference_time(part.time)
-            out[part.camera] = min(out[part.camera, 0], times.min()), max(out[part.camera, 1], times.max())
-    return out
+        times = state.cameras[part.camera].reference_time(part.time)
+        first[part.camera] = times.min(initial=first[part.camera])
+        last[part.camera] = times.max(initial=last[part.camera])
+    return np.asarray(0.5 * (np.maximum(first[:, None], first) + np.minimum(last[:, None], last)))
 
 
 def position_std(cov: Covariance, camera: int) -> Floats:

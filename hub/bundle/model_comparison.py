@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from hub.bundle.adjustment import apply_step, estimate_noise, gauge_tangent
-from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, cho_solve_path, eliminate
+from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, eliminate
 from hub.bundle.correlated_noise import lens_tolerance
 from hub.bundle.gauss_markov import estimate_correlated_noise
 from hub.bundle.noise_scale import correlation_inflation, modelled_inflation
@@ -206,7 +206,9 @@ def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessP
     """Free columns (p,), normal matrix (p, p) and gradient (p,) of the camera parameters, the paths eliminated."""
     system, _ = build_system(problem, state, prior, robust=False)
     parts = eliminate(system)
-    gradient = system.gradient_cameras - system.border.transposed_times(cho_solve_path(parts, system.gradient_path))
+    gradient = system.gradient_cameras - system.border.transposed_times(
+        cho_solve_banded(parts.factor, system.gradient_path)
+    )
     return problem.free_columns(), parts.reduced, gradient
 
 
@@ -349,7 +351,7 @@ class _Linearised:
         prior = replace(prior, weights=tuple(share * weight for weight in prior.weights))
         system, _ = build_system(wide, noisy, prior, robust=False)
         parts = eliminate(system)
-        path = cho_solve_path(parts, system.gradient_path)
+        path = cho_solve_banded(parts.factor, system.gradient_path)
         tangent = gauge_tangent(wide, state)
         directions: Floats = np.eye(len(system.gradient_cameras)) if tangent is None else tangent
         covariance = directions @ np.linalg.solve(directions.T @ parts.reduced @ directions, directions.T)

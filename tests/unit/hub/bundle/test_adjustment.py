@@ -9,7 +9,7 @@ import pytest
 
 from hub.bundle import bordered_system
 from hub.bundle.adjustment import adjust, apply_step, gauge, gauge_tangent
-from hub.bundle.bordered_system import BAND, BorderedSystem, eliminate, solve
+from hub.bundle.bordered_system import BAND, BorderedSystem, PathByCameras, eliminate, solve
 from hub.bundle.covariance import _inverse_blocks
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
@@ -395,3 +395,50 @@ def test_a_row_that_a_clock_moves_past_the_end_of_the_path_still_has_a_gradient(
     assert np.isfinite(line.residual).all()
     far = linearise(rows, replace(early, offset=early.offset - path.basis.spacing), path)
     assert not far.valid.all()
+
+
+def street_system(cameras: int, width: int = 8, size: int = 6) -> BorderedSystem:
+    """Of labels that three neighbouring cameras observe each, the cameras in no order."""
+    rng = np.random.default_rng(cameras)
+    order, step = rng.permutation(cameras), 3 * size
+    paths = step * (cameras - 2)
+    whole, parts = np.zeros((paths + width * cameras,) * 2), []
+    for label in range(cameras - 2):
+        columns = np.concatenate([width * camera + np.arange(width) for camera in order[label : label + 3]])
+        for camera in range(3):
+            for first in np.repeat(np.arange(size - 3), 8):
+                row = np.zeros((2, len(whole)))
+                row[:, step * label + 3 * first + np.arange(12)] = rng.normal(size=(2, 12))
+                row[:, paths + columns[width * camera : width * (camera + 1)]] = rng.normal(size=(2, width))
+                whole += row.T @ row
+        part = slice(step * label, step * (label + 1))
+        parts.append((part, columns, whole[part, paths + columns]))
+    band = np.zeros((BAND, paths))
+    for distance in range(BAND):
+        band[BAND - 1 - distance, distance:] = np.diagonal(whole[:paths, :paths], distance)
+    border, gradient = PathByCameras(tuple(parts), width * cameras), rng.normal(size=len(whole))
+    return BorderedSystem(band, border, whole[paths:, paths:], gradient[:paths], gradient[paths:])
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_the_step_of_cameras_that_overlap_few_others_equals_the_dense_one(
+    held: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system, fixed = street_system(24), None
+    if held:
+        fixed = np.zeros((7, len(system.corner)))
+        fixed[np.arange(6), 40 + np.arange(6)] = 1.0
+        fixed[6, 83:86] = [0.6, 0.0, -0.8]
+    banded = solve(system, 1e-3, fixed)
+    monkeypatch.setattr(bordered_system, "_solve_banded_cameras", None)  # it is what was called
+    with pytest.raises(TypeError):
+        solve(system, 1e-3, fixed)
+    monkeypatch.setattr(bordered_system, "_narrowest_order", lambda groups, size: (np.arange(size), size))
+    for ours, expected in zip(banded, solve(system, 1e-3, fixed), strict=True):
+        np.testing.assert_allclose(ours, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
+    if fixed is not None:
+        assert np.abs(fixed @ banded[1]).max() < 1e-12 * np.abs(banded[1]).max()
+    monkeypatch.undo()
+    system.corner[30, 30] = -1e9
+    with pytest.raises(np.linalg.LinAlgError):
+        solve(system, 1e-3, fixed)
