@@ -149,7 +149,7 @@ def _reject_single_views(parts: list[TrackObservations], state: AdjustmentState)
 def gauge_tangent(problem: Problem, state: AdjustmentState) -> Floats | None:
     """Orthonormal directions (p, p - 7) in which the free camera parameters may move: perpendicular to `gauge`."""
     fixed = gauge(problem, state)
-    return None if fixed is None else complement(fixed)
+    return None if fixed is None else complement(fixed).toarray()
 
 
 def gauge(problem: Problem, state: AdjustmentState) -> Floats | None:

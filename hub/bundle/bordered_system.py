@@ -13,9 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from hub.bundle.problem import CAMERA_PARAMETERS
@@ -233,15 +234,18 @@ def solve(system: BorderedSystem, damping: float, fixed: Floats | None) -> tuple
         matrix = system.corner + np.diag(damping * np.diag(system.corner) + _CAMERA_REGULARISATION)
         for columns, gram in grams:
             matrix[np.ix_(columns, columns)] -= gram
-        tangent = np.eye(len(rhs)) if fixed is None else complement(fixed)
+        tangent = complement(np.zeros((0, len(rhs))) if fixed is None else fixed)
         cameras = tangent @ np.linalg.solve(tangent.T @ matrix @ tangent, tangent.T @ rhs)
     path = cho_solve_banded(factor, system.gradient_path + system.border @ cameras)
     return -path, np.asarray(cameras)
 
 
-def complement(fixed: Floats) -> Floats:
-    """Orthonormal directions (p, p - q) perpendicular to ``fixed`` (q, p)."""
-    return np.asarray(np.linalg.svd(fixed)[2][len(fixed) :].T)
+def complement(fixed: Floats) -> csr_array[Any]:
+    """Orthonormal directions (p, p - q) perpendicular to ``fixed`` (q, p): parameters that it does not touch, alone."""
+    touched = fixed.any(axis=0)
+    places = np.concatenate([np.flatnonzero(~touched), np.flatnonzero(touched)])
+    mixed = np.linalg.svd(fixed[:, touched])[2][len(fixed) :].T
+    return csr_array(block_diag([eye_array(int((~touched).sum())), mixed]))[np.argsort(places)]
 
 
 def _narrowest_order(groups: list[Ints], size: int) -> tuple[Ints, int]:

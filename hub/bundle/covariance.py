@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erf
 
-from hub.bundle.bordered_system import BAND, PathByCameras, eliminate, regularisation
+from hub.bundle.bordered_system import BAND, PathByCameras, complement, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
@@ -86,11 +86,13 @@ def constrained_step(normal: Floats, right: Floats, rows: Floats, values: Floats
     if not len(rows):
         covariance: Floats = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         return covariance @ right, covariance
-    length = np.linalg.norm(rows, axis=1)
-    left, size, vt = np.linalg.svd(rows / length[:, None])
+    length, touched = np.linalg.norm(rows, axis=1), rows.any(axis=0)
+    left, size, short = np.linalg.svd(rows[:, touched] / length[:, None], full_matrices=False)
     rank = int(np.count_nonzero(size > 1e-9 * size[0]))
-    fixed = -vt[:rank].T @ ((left[:, :rank].T @ (values / length)) / size[:rank])
-    tangent = vt[rank:].T
+    vt = np.zeros((rank, rows.shape[1]))
+    vt[:, touched] = short[:rank]
+    fixed = -vt.T @ ((left[:, :rank].T @ (values / length)) / size[:rank])
+    tangent = complement(vt)
     covariance = np.asarray(tangent @ np.linalg.inv(tangent.T @ normal @ tangent) @ tangent.T, dtype=np.float64)
     return fixed + covariance @ (right - normal @ fixed), covariance
 
@@ -148,12 +150,11 @@ def time_map_std(cov: Covariance, state: AdjustmentState, camera: int, reference
     if camera == reference:
         return 0.0
     now, base = state.cameras[camera], state.cameras[reference]
-    row = np.zeros(len(cov.cameras))
-    row[camera * CAMERA_PARAMETERS + OFFSET] = 1.0
     at = float(base.camera_time(np.array([now.offset]))[0])
-    row[reference * CAMERA_PARAMETERS + OFFSET] -= 1.0
-    row[reference * CAMERA_PARAMETERS + RATE] -= at - base.centre
-    return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / base.rate)
+    of_reference = reference * CAMERA_PARAMETERS
+    columns = [camera * CAMERA_PARAMETERS + OFFSET, of_reference + OFFSET, of_reference + RATE]
+    row = np.array([1.0, -1.0, base.centre - at])
+    return float(np.sqrt(max(float(row @ cov.cameras[np.ix_(columns, columns)] @ row), 0.0)) / base.rate)
 
 
 def inner_constraints(a_inv_b: PathByCameras, state: AdjustmentState, datum_points: list[tuple[int, Floats]]) -> Floats:
@@ -183,10 +184,9 @@ def inner_constraints(a_inv_b: PathByCameras, state: AdjustmentState, datum_poin
 
 def clock_rate_std(cov: Covariance, state: AdjustmentState, camera: int, reference: int) -> float:
     """Std of the camera's clock rate relative to the reference camera's."""
-    row = np.zeros(len(cov.cameras))
-    row[camera * CAMERA_PARAMETERS + RATE] += 1.0
-    row[reference * CAMERA_PARAMETERS + RATE] -= 1.0
-    return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / state.cameras[reference].rate)
+    columns = np.array([camera, reference]) * CAMERA_PARAMETERS + RATE
+    (own, shared), (_, other) = cov.cameras[np.ix_(columns, columns)]
+    return float(np.sqrt(max(own - 2.0 * shared + other, 0.0)) / state.cameras[reference].rate)
 
 
 def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentState) -> Floats:

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from hub.bundle.adjustment import apply_step, estimate_noise, gauge_tangent
-from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, eliminate
+from hub.bundle.adjustment import apply_step, estimate_noise, gauge, gauge_tangent
+from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, complement, eliminate
 from hub.bundle.correlated_noise import lens_tolerance
 from hub.bundle.gauss_markov import estimate_correlated_noise
 from hub.bundle.noise_scale import correlation_inflation, modelled_inflation
@@ -101,7 +101,7 @@ def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[LensTest]:
     kept = np.setdiff1d(np.arange(len(columns)), np.concatenate(list(lens.values())))
     out: list[LensTest] = []
     while len(out) < len(given):
-        _, step, covariance = _reduction(normal, gradient, gauge_tangent(freed, state), kept)
+        _, step, covariance = _reduction(normal, gradient, gauge(freed, state), kept)
         found = []
         for camera in set(given) - {one.camera for one in out}:
             # What two parameters more lower the cost by: one step of them beside all others (Schur complement).
@@ -130,7 +130,7 @@ def with_crystal_rates(problem: Problem, state: AdjustmentState) -> Problem:
     inflation = correlation_inflation(problem, state)
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
     columns, normal, gradient = _reduced_system(wide, noisy, estimate_smoothness(problem, state))
-    covariance = _reduction(normal, gradient, gauge_tangent(wide, state), np.arange(len(columns)))[2]
+    covariance = _reduction(normal, gradient, gauge(wide, state), np.arange(len(columns)))[2]
     variance = dict(zip(columns.tolist(), np.diag(covariance).tolist(), strict=True))
     reference = state.cameras[problem.clock_reference].rate
     crystal = tuple(
@@ -194,12 +194,9 @@ def without_negative_readouts(problem: Problem, state: AdjustmentState) -> tuple
 def _cost_reduction(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, readout_columns: Bools) -> float:
     """Predicted decrease of the cost in one step when the columns ``readout_columns`` (p,) are freed too."""
     _, normal, gradient = _reduced_system(problem, state, prior)
-    tangent = gauge_tangent(problem, state)
-    everything = np.arange(len(gradient))
-    return (
-        _reduction(normal, gradient, tangent, everything)[0]
-        - _reduction(normal, gradient, tangent, everything[~readout_columns])[0]
-    )
+    fixed, everything = gauge(problem, state), np.arange(len(gradient))
+    free, held = (_reduction(normal, gradient, fixed, kept)[0] for kept in (everything, everything[~readout_columns]))
+    return free - held
 
 
 def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> tuple[Ints, Floats, Floats]:
@@ -212,16 +209,15 @@ def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessP
     return problem.free_columns(), parts.reduced, gradient
 
 
-def _reduction(normal: Floats, gradient: Floats, tangent: Floats | None, kept: Ints) -> tuple[float, Floats, Floats]:
+def _reduction(normal: Floats, gradient: Floats, fixed: Floats | None, kept: Ints) -> tuple[float, Floats, Floats]:
     """Predicted decrease of the cost in one step of the parameters ``kept``, the step (p,) and its covariance (p, p).
 
-    tangent: (p, q) directions that keep the gauge, which fixes poses only.
+    fixed: (q, p) directions of the gauge, of poses only.
     """
-    directions: Floats = np.eye(len(gradient)) if tangent is None else tangent
-    others = np.setdiff1d(np.arange(len(gradient)), kept)
-    if len(others):
-        directions = directions @ np.linalg.svd(directions[others])[2][len(others) :].T
-    covariance = directions @ np.linalg.solve(directions.T @ normal @ directions, directions.T)
+    directions = complement(np.zeros((0, len(kept))) if fixed is None else fixed[:, kept])
+    covariance = np.zeros_like(normal)
+    inverse = np.linalg.inv(directions.T @ normal[np.ix_(kept, kept)] @ directions)
+    covariance[np.ix_(kept, kept)] = directions @ inverse @ directions.T
     step = -covariance @ gradient
     return float(-gradient @ step), step, covariance
 
