@@ -227,15 +227,21 @@ def solve(system: BorderedSystem, damping: float, fixed: Floats | None) -> tuple
         gram = half_solved.T @ half_solved
         rhs[columns] += gram[:-1, -1]
         grams.append((columns, gram[:-1, :-1]))
+    # ``fixed`` x = 0 changes nothing of the minimum if its squares are added to the matrix, which is then definite.
+    fixed = np.zeros((0, len(rhs))) if fixed is None else fixed
+    squares = (fixed, fixed**2 @ np.diag(system.corner))
+    diagonal = np.asarray(damping * np.diag(system.corner) + _CAMERA_REGULARISATION)
+    right = np.column_stack([rhs, fixed.T])
     order, bandwidth = _narrowest_order([columns for columns, _ in grams], len(rhs))
     if 2 * bandwidth < len(rhs):
-        cameras = _solve_banded_cameras(system.corner, grams, rhs, damping, fixed, order, bandwidth)
+        solved = _solve_banded_cameras(system.corner, diagonal, grams, squares, right, order, bandwidth)
     else:
-        matrix = system.corner + np.diag(damping * np.diag(system.corner) + _CAMERA_REGULARISATION)
+        matrix = system.corner + np.diag(diagonal) + fixed.T @ (squares[1][:, None] * fixed)
         for columns, gram in grams:
             matrix[np.ix_(columns, columns)] -= gram
-        tangent = complement(np.zeros((0, len(rhs))) if fixed is None else fixed)
-        cameras = tangent @ np.linalg.solve(tangent.T @ matrix @ tangent, tangent.T @ rhs)
+        solved = np.linalg.solve(matrix, right)
+    moved = solved[:, 1:]
+    cameras = solved[:, 0] - moved @ np.linalg.solve(fixed @ moved, fixed @ solved[:, 0])
     path = cho_solve_banded(factor, system.gradient_path + system.border @ cameras)
     return -path, np.asarray(cameras)
 
@@ -261,19 +267,19 @@ def _narrowest_order(groups: list[Ints], size: int) -> tuple[Ints, int]:
 
 def _solve_banded_cameras(
     corner: Floats,
+    diagonal: Floats,
     grams: list[tuple[Ints, Floats]],
-    rhs: Floats,
-    damping: float,
-    fixed: Floats | None,
+    squares: tuple[Floats, Floats],
+    right: Floats,
     order: Ints,
     bandwidth: int,
 ) -> Floats:
-    """The cameras' step (p,) where the Schur complement is a band in this order. Raises LinAlgError.
+    """Solution (p, k) where the Schur complement of ``grams`` is a band in this order. Raises LinAlgError.
 
-    ``fixed`` x = 0 changes nothing of the minimum if its squares are added to the matrix, which is then definite.
+    diagonal: (p,) to be added. squares: rows (q, p) of few parameters whose squares are added, and their weights.
     """
-    fixed, place = np.zeros((0, len(rhs))) if fixed is None else fixed, np.argsort(order)
-    band = np.zeros((len(rhs), bandwidth + 1))  # by column, what is above the diagonal first
+    place = np.argsort(order)
+    band = np.zeros((len(order), bandwidth + 1))  # by column, what is above the diagonal first
 
     def add(columns: Ints, block: Floats) -> None:
         inner = np.argsort(place[columns])
@@ -281,23 +287,18 @@ def _solve_banded_cameras(
         at = place[columns[inner]]
         band[at[second], bandwidth - at[second] + at[first]] += block[np.ix_(inner, inner)][first, second]
 
-    diagonal = np.diag(corner)
     for distance in range(CAMERA_PARAMETERS):
         one, other = place[: len(place) - distance], place[distance:]
         values, apart = np.diagonal(corner, distance), np.abs(one - other)
         within = apart <= bandwidth  # else of two cameras, and 0
         band[np.maximum(one, other)[within], bandwidth - apart[within]] += values[within]
-    band[:, -1] += (damping * diagonal + _CAMERA_REGULARISATION)[order]
+    band[:, -1] += diagonal[order]
     for columns, gram in grams:
         add(columns, -gram)
-    for row in fixed:
+    for row, weight in zip(*squares, strict=True):
         columns = np.flatnonzero(row)
-        scale = float(diagonal[columns] @ row[columns] ** 2)
-        add(columns, scale * np.outer(row[columns], row[columns]))
-    right = np.column_stack([rhs, fixed.T])[order]
-    solved = cho_solve_banded(cholesky_banded(band.T), right)[place]
-    step, moved = solved[:, 0], solved[:, 1:]
-    return np.asarray(step - moved @ np.linalg.solve(fixed @ moved, fixed @ step))
+        add(columns, weight * np.outer(row[columns], row[columns]))
+    return cho_solve_banded(cholesky_banded(band.T), right[order])[place]
 
 
 def _damped_cholesky(band: Floats, damping: float) -> Floats:

@@ -102,7 +102,8 @@ def assemble(
             index = one.index[part] - first_rows[label] // 3
             path_terms, camera_terms = blocks[label].add_rows(index, one.weights[part], terms[:, :, part])
             gradient_path[first_rows[label] : first_rows[label + 1]] += path_terms[:, -1]
-            border[label][camera] = border[label].get(camera, 0.0) + path_terms[:, :-1]
+            before = border[label].get(camera)
+            border[label][camera] = path_terms[:, :-1] if before is None else before + path_terms[:, :-1]
             corner[np.ix_(own, own)] += camera_terms[:-1, :-1]
             gradient_cameras[own] += camera_terms[:-1, -1]
     parts = []
