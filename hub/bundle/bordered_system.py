@@ -236,10 +236,10 @@ def solve(system: BorderedSystem, damping: float, fixed: Floats | None) -> tuple
     if 2 * bandwidth < len(rhs):
         solved = _solve_banded_cameras(system.corner, diagonal, grams, squares, right, order, bandwidth)
     else:
-        matrix = system.corner + np.diag(diagonal) + fixed.T @ (squares[1][:, None] * fixed)
+        matrix: Floats = system.corner + np.diag(diagonal) + fixed.T @ (squares[1][:, None] * fixed)
         for columns, gram in grams:
             matrix[np.ix_(columns, columns)] -= gram
-        solved = np.linalg.solve(matrix, right)
+        solved = np.asarray(np.linalg.solve(matrix, right))
     moved = solved[:, 1:]
     cameras = solved[:, 0] - moved @ np.linalg.solve(fixed @ moved, fixed @ solved[:, 0])
     path = cho_solve_banded(factor, system.gradient_path + system.border @ cameras)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -93,14 +94,15 @@ def assemble(
     for camera, one, weight in zip(residuals.cameras, residuals.evaluations, residuals.weights, strict=True):
         own = columns_of[camera]
         jacobian = jacobians(one, state.cameras[camera], (columns[own] % CAMERA_PARAMETERS).tolist())
-        terms, root = np.empty((2, jacobian.shape[1] + 1, len(weight))), np.sqrt(weight)
-        np.multiply(jacobian, root, out=terms[:, :-1])
-        np.multiply(one.residual, root, out=terms[:, -1])
-        labels = np.searchsorted(first_rows, 3 * one.index, side="right") - 1
-        for rows in np.split(np.arange(len(labels)), np.flatnonzero(np.diff(labels)) + 1) if len(labels) else ():
-            label, part = int(labels[rows[0]]), slice(rows[0], rows[-1] + 1)
+        root, labels = np.sqrt(weight), np.searchsorted(first_rows, 3 * one.index, side="right") - 1
+        edges = [0, *(np.flatnonzero(np.diff(labels)) + 1).tolist(), len(labels)]
+        for begin, end in pairwise(edges) if len(labels) else ():
+            label, part = int(labels[begin]), slice(begin, end)
+            terms = np.empty((2, jacobian.shape[1] + 1, end - begin))
+            np.multiply(jacobian[:, :, part], root[part], out=terms[:, :-1])
+            np.multiply(one.residual[:, part], root[part], out=terms[:, -1])
             index = one.index[part] - first_rows[label] // 3
-            path_terms, camera_terms = blocks[label].add_rows(index, one.weights[part], terms[:, :, part])
+            path_terms, camera_terms = blocks[label].add_rows(index, one.weights[part], terms)
             gradient_path[first_rows[label] : first_rows[label + 1]] += path_terms[:, -1]
             before = border[label].get(camera)
             border[label][camera] = path_terms[:, :-1] if before is None else before + path_terms[:, :-1]
