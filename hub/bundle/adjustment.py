@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
-from hub.bundle.bordered_system import complement, solve
+from hub.bundle.bordered_system import solve
 from hub.bundle.normal_equations import assemble, weigh_residuals
 from hub.bundle.problem import (
     ASPECT,
@@ -146,17 +146,12 @@ def _reject_single_views(parts: list[TrackObservations], state: AdjustmentState)
     return out
 
 
-def gauge_tangent(problem: Problem, state: AdjustmentState) -> Floats | None:
-    """Orthonormal directions (p, p - 7) in which the free camera parameters may move: perpendicular to `gauge`."""
-    fixed = gauge(problem, state)
-    return None if fixed is None else complement(fixed).toarray()
-
-
-def gauge(problem: Problem, state: AdjustmentState) -> Floats | None:
+def gauge(problem: Problem, state: AdjustmentState) -> Floats:
     """Orthonormal directions (7, p) in which the free camera parameters do not move: the pose of the first anchor and
-    the distance between the two anchors. None where poses are not free."""
+    the distance between the two anchors. (0, p) where poses are not free."""
+    columns = problem.free_columns()
     if not problem.free_parameters.pose:
-        return None
+        return np.zeros((0, len(columns)))
     first, second = problem.anchors
     width = len(state.cameras) * CAMERA_PARAMETERS
     constraints = np.zeros((7, width))
@@ -164,7 +159,7 @@ def gauge(problem: Problem, state: AdjustmentState) -> Floats | None:
     baseline = state.cameras[second].pose.position - state.cameras[first].pose.position
     baseline = baseline / np.linalg.norm(baseline)
     constraints[6, second * CAMERA_PARAMETERS + 3 : second * CAMERA_PARAMETERS + 6] = baseline
-    return constraints[:, problem.free_columns()]
+    return constraints[:, columns]
 
 
 def apply_step(problem: Problem, state: AdjustmentState, path_step: Floats, camera_step: Floats) -> AdjustmentState:

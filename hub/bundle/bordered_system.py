@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from scipy.sparse import block_diag, csc_array, csr_array, eye_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from hub.bundle.problem import CAMERA_PARAMETERS
@@ -212,10 +211,10 @@ def eliminate(system: BorderedSystem, damping: float = 0.0) -> Elimination:
     return Elimination(factor, replace(system.border, parts=tuple(parts)), np.asarray(0.5 * (reduced + reduced.T)))
 
 
-def solve(system: BorderedSystem, damping: float, fixed: Floats | None) -> tuple[Floats, Floats]:
+def solve(system: BorderedSystem, damping: float, fixed: Floats) -> tuple[Floats, Floats]:
     """Levenberg-Marquardt step (path (3 n,), cameras (p,)). Raises LinAlgError.
 
-    fixed: (q, p) orthonormal directions in which the cameras do not move (the gauge); None = none.
+    fixed: (q, p) orthonormal directions in which the cameras do not move (the gauge).
     """
     factor = _damped_cholesky(system.band, damping)
     rhs, grams = -system.gradient_cameras, []
@@ -228,7 +227,6 @@ def solve(system: BorderedSystem, damping: float, fixed: Floats | None) -> tuple
         rhs[columns] += gram[:-1, -1]
         grams.append((columns, gram[:-1, :-1]))
     # ``fixed`` x = 0 changes nothing of the minimum if its squares are added to the matrix, which is then definite.
-    fixed = np.zeros((0, len(rhs))) if fixed is None else fixed
     squares = (fixed, fixed**2 @ np.diag(system.corner))
     diagonal = np.asarray(damping * np.diag(system.corner) + _CAMERA_REGULARISATION)
     right = np.column_stack([rhs, fixed.T])
@@ -244,14 +242,6 @@ def solve(system: BorderedSystem, damping: float, fixed: Floats | None) -> tuple
     cameras = solved[:, 0] - moved @ np.linalg.solve(fixed @ moved, fixed @ solved[:, 0])
     path = cho_solve_banded(factor, system.gradient_path + system.border @ cameras)
     return -path, np.asarray(cameras)
-
-
-def complement(fixed: Floats) -> csr_array[Any]:
-    """Orthonormal directions (p, p - q) perpendicular to ``fixed`` (q, p): parameters that it does not touch, alone."""
-    touched = fixed.any(axis=0)
-    places = np.concatenate([np.flatnonzero(~touched), np.flatnonzero(touched)])
-    mixed = np.linalg.svd(fixed[:, touched])[2][len(fixed) :].T
-    return csr_array(block_diag([eye_array(int((~touched).sum())), mixed]))[np.argsort(places)]
 
 
 def _narrowest_order(groups: list[Ints], size: int) -> tuple[Ints, int]:

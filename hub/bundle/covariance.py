@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from scipy.sparse import block_diag, csr_array, eye_array
 from scipy.special import erf
 
-from hub.bundle.bordered_system import BAND, PathByCameras, complement, eliminate, regularisation
+from hub.bundle.bordered_system import BAND, PathByCameras, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
@@ -54,7 +56,7 @@ def covariance(
     parts = eliminate(system)
     columns = problem.free_columns()
     information = parts.reduced
-    constraints = None
+    constraints = np.zeros((0, len(columns)))
     if problem.free_parameters.pose:
         prior_information = (
             np.zeros((len(state.cameras) * CAMERA_PARAMETERS,) * 2)
@@ -68,10 +70,7 @@ def covariance(
             constraints = gauge_constraints([camera.pose for camera in state.cameras], prior_information)[:, columns]
         if exact is not None:
             constraints = np.concatenate([constraints, exact[:, columns]])
-    free = np.zeros((0, 0))
-    if len(columns):
-        rows = np.zeros((0, len(columns))) if constraints is None else constraints
-        _, free = constrained_step(information, np.zeros(len(columns)), rows, np.zeros(len(rows)))
+    _, free = constrained_step(information, np.zeros(len(columns)), constraints, np.zeros(len(constraints)))
     width = len(state.cameras) * CAMERA_PARAMETERS
     full = np.zeros((width, width))
     full[np.ix_(columns, columns)] = free
@@ -92,9 +91,17 @@ def constrained_step(normal: Floats, right: Floats, rows: Floats, values: Floats
     vt = np.zeros((rank, rows.shape[1]))
     vt[:, touched] = short[:rank]
     fixed = -vt.T @ ((left[:, :rank].T @ (values / length)) / size[:rank])
-    tangent = complement(vt)
+    tangent = _complement(vt)
     covariance = np.asarray(tangent @ np.linalg.inv(tangent.T @ normal @ tangent) @ tangent.T, dtype=np.float64)
     return fixed + covariance @ (right - normal @ fixed), covariance
+
+
+def _complement(fixed: Floats) -> csr_array[Any]:
+    """Orthonormal directions (p, p - q) perpendicular to ``fixed`` (q, p): parameters that it does not touch, alone."""
+    touched = fixed.any(axis=0)
+    places = np.concatenate([np.flatnonzero(~touched), np.flatnonzero(touched)])
+    mixed = np.linalg.svd(fixed[:, touched])[2][len(fixed) :].T
+    return csr_array(block_diag([eye_array(int((~touched).sum())), mixed]))[np.argsort(places)]
 
 
 def relative_rotation_stds(cameras: Floats, state: AdjustmentState) -> Floats:

@@ -16,9 +16,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from hub.bundle.adjustment import apply_step, estimate_noise, gauge, gauge_tangent
-from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, complement, eliminate
+from hub.bundle.adjustment import apply_step, estimate_noise, gauge
+from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, eliminate
 from hub.bundle.correlated_noise import lens_tolerance
+from hub.bundle.covariance import constrained_step
 from hub.bundle.gauss_markov import estimate_correlated_noise
 from hub.bundle.noise_scale import correlation_inflation, modelled_inflation
 from hub.bundle.normal_equations import build_system
@@ -209,16 +210,15 @@ def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessP
     return problem.free_columns(), parts.reduced, gradient
 
 
-def _reduction(normal: Floats, gradient: Floats, fixed: Floats | None, kept: Ints) -> tuple[float, Floats, Floats]:
+def _reduction(normal: Floats, gradient: Floats, fixed: Floats, kept: Ints) -> tuple[float, Floats, Floats]:
     """Predicted decrease of the cost in one step of the parameters ``kept``, the step (p,) and its covariance (p, p).
 
     fixed: (q, p) directions of the gauge, of poses only.
     """
-    directions = complement(np.zeros((0, len(kept))) if fixed is None else fixed[:, kept])
-    covariance = np.zeros_like(normal)
-    inverse = np.linalg.inv(directions.T @ normal[np.ix_(kept, kept)] @ directions)
-    covariance[np.ix_(kept, kept)] = directions @ inverse @ directions.T
-    step = -covariance @ gradient
+    step, covariance = np.zeros_like(gradient), np.zeros_like(normal)
+    step[kept], covariance[np.ix_(kept, kept)] = constrained_step(
+        normal[np.ix_(kept, kept)], -gradient[kept], fixed[:, kept], np.zeros(len(fixed))
+    )
     return float(-gradient @ step), step, covariance
 
 
@@ -348,10 +348,8 @@ class _Linearised:
         system, _ = build_system(wide, noisy, prior, robust=False)
         parts = eliminate(system)
         path = cho_solve_banded(parts.factor, system.gradient_path)
-        tangent = gauge_tangent(wide, state)
-        directions: Floats = np.eye(len(system.gradient_cameras)) if tangent is None else tangent
-        covariance = directions @ np.linalg.solve(directions.T @ parts.reduced @ directions, directions.T)
-        gradient = system.gradient_cameras - system.border.transposed_times(path)
+        gradient, fixed = system.gradient_cameras - system.border.transposed_times(path), gauge(wide, state)
+        _, covariance = constrained_step(parts.reduced, gradient, fixed, np.zeros(len(fixed)))
         return cls(wide, noisy, system, parts, path, gradient, covariance)
 
     def best_step(self, camera: int, times: Floats) -> tuple[ClockStep, Floats, Floats]:
