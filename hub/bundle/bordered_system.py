@@ -226,7 +226,7 @@ def solve(system: BorderedSystem, damping: float, fixed: Floats) -> tuple[Floats
         gram = half_solved.T @ half_solved
         rhs[columns] += gram[:-1, -1]
         grams.append((columns, gram[:-1, :-1]))
-    # ``fixed`` x = 0 changes nothing of the minimum if its squares are added to the matrix, which is then definite.
+    # Where ``fixed`` x = 0, adding its squares to the matrix changes nothing, and the matrix is then definite.
     squares = (fixed, fixed**2 @ np.diag(system.corner))
     diagonal = np.asarray(damping * np.diag(system.corner) + _CAMERA_REGULARISATION)
     right = np.column_stack([rhs, fixed.T])
