@@ -88,13 +88,12 @@ def estimate_noise(problem: Problem, state: AdjustmentState) -> Floats:
     sigma = state.sigma.copy()
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return np.full(len(sigma), _pooled_noise(problem, state))
-    for camera in range(len(state.cameras)):
-        parts = [
-            residual_norms(rows, state.cameras[camera], state.trajectories[rows.label])[rows.use]
-            for rows in problem.rows
-            if rows.camera == camera
-        ]
-        values = np.concatenate(parts) if parts else np.zeros(0)
+    by_camera: dict[int, list[Floats]] = {}
+    for rows in problem.rows:
+        norms = residual_norms(rows, state.cameras[rows.camera], state.trajectories[rows.label])
+        by_camera.setdefault(rows.camera, []).append(norms[rows.use])
+    for camera, parts in by_camera.items():
+        values = np.concatenate(parts)
         values = values[np.isfinite(values)]
         if len(values) >= 8:
             sigma[camera] = max(_MIN_SIGMA_PX, float(np.median(values)) / 1.1774)
@@ -147,14 +146,12 @@ def _reject_single_views(parts: list[TrackObservations], state: AdjustmentState)
     return out
 
 
-def gauge_tangent(problem: Problem, state: AdjustmentState) -> Floats | None:
-    """Orthonormal directions (p, q) in which the free camera parameters may move with the gauge fixed.
-
-    Fixed: pose of the first anchor, distance between the two anchors. None where poses are not free.
-    """
-    if not problem.free_parameters.pose:
-        return None
+def gauge(problem: Problem, state: AdjustmentState) -> Floats:
+    """Orthonormal directions (7, p) in which the free camera parameters do not move: the pose of the first anchor and
+    the distance between the two anchors. (0, p) where poses are not free."""
     columns = problem.free_columns()
+    if not problem.free_parameters.pose:
+        return np.zeros((0, len(columns)))
     first, second = problem.anchors
     width = len(state.cameras) * CAMERA_PARAMETERS
     constraints = np.zeros((7, width))
@@ -162,8 +159,7 @@ def gauge_tangent(problem: Problem, state: AdjustmentState) -> Floats | None:
     baseline = state.cameras[second].pose.position - state.cameras[first].pose.position
     baseline = baseline / np.linalg.norm(baseline)
     constraints[6, second * CAMERA_PARAMETERS + 3 : second * CAMERA_PARAMETERS + 6] = baseline
-    _, _, vt = np.linalg.svd(constraints[:, columns])
-    return np.asarray(vt[7:].T)
+    return constraints[:, columns]
 
 
 def apply_step(problem: Problem, state: AdjustmentState, path_step: Floats, camera_step: Floats) -> AdjustmentState:
@@ -239,7 +235,7 @@ def _minimise(
     for _ in range(iterations):
         system = system or assemble(problem, state, prior, current)
         try:
-            path_step, camera_step = solve(system, damping, gauge_tangent(problem, state))
+            path_step, camera_step = solve(system, damping, gauge(problem, state))
         except np.linalg.LinAlgError:
             damping *= 10.0
             continue

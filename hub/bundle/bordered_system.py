@@ -1,20 +1,24 @@
-"""Linear solver of the adjustment: banded trajectory block with a dense border of camera parameters (Schur complement).
+"""Linear solver of the adjustment: banded trajectory block with a border of camera parameters (Schur complement).
 
     [ A  B ] [ control points ]   [ g ]
     [ Bᵀ C ] [ cameras        ] = [ h ]
 
 A is banded because the spline at one time depends on four control points; eliminating it costs time linear in the
-length of the recording (Schur complement C - Bᵀ A⁻¹ B).
+length of the recording (Schur complement C - Bᵀ A⁻¹ B). A label's path meets only the cameras that observe it. Where
+each camera shares labels with few others, the Schur complement is banded too, in the order of Cuthill and McKee
+("Reducing the bandwidth of sparse symmetric matrices", 1969).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from hub.bundle.problem import CAMERA_PARAMETERS
 from hub.trajectory.banded import cho_solve_banded, cholesky_banded, solve_upper_transposed
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT, SplineBasis
@@ -30,19 +34,43 @@ except (ImportError, AttributeError):
 
 _ROWS_AT_ONCE = 1001  # products of so many fit a core's cache; no power of two, whose columns displace each other there
 
+_CAMERA_REGULARISATION = 1e-12  # of the cameras' normal matrix: parameters that nothing determines stay
+
 BAND = 3 * SUPPORT
 """Upper bands stored: four control points of three coordinates."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PathByCameras:
+    """A matrix (3 n, p) of all paths by all camera parameters, zero where a camera does not observe a label.
+
+    parts: of each label its rows, the columns (k,) of its cameras and the block (rows, k). width: p.
+    """
+
+    parts: tuple[tuple[slice, Ints, Floats], ...]
+    width: int
+
+    def __matmul__(self, cameras: Floats) -> Floats:
+        """(3 n,) of (p,)."""
+        return np.concatenate([np.zeros(0), *(block @ cameras[columns] for _, columns, block in self.parts)])
+
+    def transposed_times(self, path: Floats) -> Floats:
+        """(p,) of (3 n,), (p, k) of (3 n, k)."""
+        out = np.zeros((self.width, *path.shape[1:]))
+        for rows, columns, block in self.parts:
+            out[columns] += block.T @ path[rows]
+        return out
+
+
 @dataclass(slots=True, eq=False)
 class BorderedSystem:
-    """Normal equations. band: (12, 3 n) upper band of A. border: (3 n, p) B. corner: (p, p) C.
+    """Normal equations. band: (12, 3 n) upper band of A. border: (3 n, p) B. corner: (p, p) C, camera by camera.
 
     gradient_path: (3 n,), gradient_cameras: (p,).
     """
 
     band: Floats
-    border: Floats
+    border: PathByCameras
     corner: Floats
     gradient_path: Floats
     gradient_cameras: Floats
@@ -165,46 +193,102 @@ def third_differences(basis: SplineBasis | PointBasis, control: Floats) -> Float
 class Elimination:
     """The factored path block and the reduced camera system. factor: Cholesky band of A.
 
-    carried: (3 n, p) A⁻¹ B. reduced: (p, p) Schur complement.
+    a_inv_b: (3 n, p) A⁻¹ B. reduced: (p, p) Schur complement.
     """
 
     factor: Floats
-    a_inv_b: Floats
+    a_inv_b: PathByCameras
     reduced: Floats
 
 
 def eliminate(system: BorderedSystem, damping: float = 0.0) -> Elimination:
     """Factor A (damped on its diagonal) and form the Schur complement. Raises LinAlgError if not positive definite."""
     factor = _damped_cholesky(system.band, damping)
-    a_inv_b = cho_solve_banded(factor, system.border)
-    reduced = system.corner - system.border.T @ a_inv_b
-    return Elimination(factor, a_inv_b, np.asarray(0.5 * (reduced + reduced.T)))
+    parts, reduced = [], system.corner.copy()
+    for rows, columns, block in system.border.parts:
+        parts.append((rows, columns, cho_solve_banded(factor[:, rows], block)))
+        reduced[np.ix_(columns, columns)] -= block.T @ parts[-1][2]
+    return Elimination(factor, replace(system.border, parts=tuple(parts)), np.asarray(0.5 * (reduced + reduced.T)))
 
 
-def cho_solve_path(parts: Elimination, rhs: Floats) -> Floats:
-    """A⁻¹ right, (3 n,) of (3 n,)."""
-    return cho_solve_banded(parts.factor, rhs)
+def solve(system: BorderedSystem, damping: float, fixed: Floats) -> tuple[Floats, Floats]:
+    """Levenberg-Marquardt step (path (3 n,), cameras (p,)). Raises LinAlgError.
 
-
-def solve(system: BorderedSystem, damping: float, tangent: Floats | None) -> tuple[Floats, Floats]:
-    """Levenberg-Marquardt step (path (3 n,), cameras (p,)).
-
-    tangent: (p, q) orthonormal directions in which the cameras may move (the gauge is fixed); None = all.
+    fixed: (q, p) orthonormal directions in which the cameras do not move (the gauge).
     """
     factor = _damped_cholesky(system.band, damping)
-    # Half of the work of `eliminate` is enough: with A = Uᵀ U and H = U⁻ᵀ [B g], Hᵀ H holds Bᵀ A⁻¹ B and Bᵀ A⁻¹ g.
-    half_solved = np.empty((factor.shape[1], len(system.gradient_cameras) + 1), order="F")
-    half_solved[:, :-1], half_solved[:, -1] = system.border, system.gradient_path
-    half_solved = solve_upper_transposed(factor, half_solved)
-    gram = half_solved.T @ half_solved
-    rhs = gram[:-1, -1] - system.gradient_cameras
-    matrix = system.corner - gram[:-1, :-1] + damping * np.diag(np.diag(system.corner)) + 1e-12 * np.eye(len(rhs))
-    if tangent is None:
-        cameras = np.linalg.solve(matrix, rhs)
+    rhs, grams = -system.gradient_cameras, []
+    for rows, columns, block in system.border.parts:
+        # Half of the work of `eliminate` is enough: with A = Uᵀ U and H = U⁻ᵀ [B g], Hᵀ H holds Bᵀ A⁻¹ B and Bᵀ A⁻¹ g.
+        half_solved = np.empty((len(block), len(columns) + 1), order="F")
+        half_solved[:, :-1], half_solved[:, -1] = block, system.gradient_path[rows]
+        half_solved = solve_upper_transposed(factor[:, rows], half_solved)
+        gram = half_solved.T @ half_solved
+        rhs[columns] += gram[:-1, -1]
+        grams.append((columns, gram[:-1, :-1]))
+    # Where ``fixed`` x = 0, adding its squares to the matrix changes nothing, and the matrix is then definite.
+    squares = (fixed, fixed**2 @ np.diag(system.corner))
+    diagonal = np.asarray(damping * np.diag(system.corner) + _CAMERA_REGULARISATION)
+    right = np.column_stack([rhs, fixed.T])
+    order, bandwidth = _narrowest_order([columns for columns, _ in grams], len(rhs))
+    if 2 * bandwidth < len(rhs):
+        solved = _solve_banded_cameras(system.corner, diagonal, grams, squares, right, order, bandwidth)
     else:
-        cameras = tangent @ np.linalg.solve(tangent.T @ matrix @ tangent, tangent.T @ rhs)
+        matrix: Floats = system.corner + np.diag(diagonal) + fixed.T @ (squares[1][:, None] * fixed)
+        for columns, gram in grams:
+            matrix[np.ix_(columns, columns)] -= gram
+        solved = np.asarray(np.linalg.solve(matrix, right))
+    moved = solved[:, 1:]
+    cameras = solved[:, 0] - moved @ np.linalg.solve(fixed @ moved, fixed @ solved[:, 0])
     path = cho_solve_banded(factor, system.gradient_path + system.border @ cameras)
     return -path, np.asarray(cameras)
+
+
+def _narrowest_order(groups: list[Ints], size: int) -> tuple[Ints, int]:
+    """Order (p,) of parameters in which those of one group are close together, and how far apart they are at most."""
+    if 2 * max(map(len, groups), default=0) >= size:
+        return np.arange(size), size
+    starts = np.cumsum([0, *map(len, groups)])
+    members = csr_array((np.ones(starts[-1]), np.concatenate(groups), starts), shape=(len(groups), size))
+    order = reverse_cuthill_mckee(csr_array(members.T @ members), symmetric_mode=True).astype(np.int64)
+    place = np.argsort(order)
+    return order, max(int(np.ptp(place[columns])) for columns in groups if len(columns))
+
+
+def _solve_banded_cameras(
+    corner: Floats,
+    diagonal: Floats,
+    grams: list[tuple[Ints, Floats]],
+    squares: tuple[Floats, Floats],
+    right: Floats,
+    order: Ints,
+    bandwidth: int,
+) -> Floats:
+    """Solution (p, k) where the Schur complement of ``grams`` is a band in this order. Raises LinAlgError.
+
+    diagonal: (p,) to be added. squares: rows (q, p) of few parameters whose squares are added, and their weights.
+    """
+    place = np.argsort(order)
+    band = np.zeros((len(order), bandwidth + 1))  # by column, what is above the diagonal first
+
+    def add(columns: Ints, block: Floats) -> None:
+        inner = np.argsort(place[columns])
+        first, second = np.triu_indices(len(columns))
+        at = place[columns[inner]]
+        band[at[second], bandwidth - at[second] + at[first]] += block[np.ix_(inner, inner)][first, second]
+
+    for distance in range(CAMERA_PARAMETERS):
+        one, other = place[: len(place) - distance], place[distance:]
+        values, apart = np.diagonal(corner, distance), np.abs(one - other)
+        within = apart <= bandwidth  # else of two cameras, and 0
+        band[np.maximum(one, other)[within], bandwidth - apart[within]] += values[within]
+    band[:, -1] += diagonal[order]
+    for columns, gram in grams:
+        add(columns, -gram)
+    for row, weight in zip(*squares, strict=True):
+        columns = np.flatnonzero(row)
+        add(columns, weight * np.outer(row[columns], row[columns]))
+    return cho_solve_banded(cholesky_banded(band.T), right[order])[place]
 
 
 def _damped_cholesky(band: Floats, damping: float) -> Floats:

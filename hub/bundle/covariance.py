@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from scipy.sparse import block_diag, csr_array, eye_array
 from scipy.special import erf
 
-from hub.bundle.bordered_system import BAND, eliminate, regularisation
+from hub.bundle.bordered_system import BAND, PathByCameras, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
@@ -26,12 +27,12 @@ _HALVINGS = 24  # of the interval: to 1e-7 of its width
 class Covariance:
     """Joint covariance of all camera parameters, and the blocks needed for that of the path.
 
-    cameras: (18 n, 18 n), zero where a parameter is fixed. carried: (3 m, p) A⁻¹ B over the free columns.
+    cameras: (18 n, 18 n), zero where a parameter is fixed. a_inv_b: (3 m, p) A⁻¹ B over the free columns.
     free: (p, p) covariance of the free columns. blocks: (k, 24, 24) blocks of A⁻¹ about the diagonal.
     """
 
     cameras: Floats
-    a_inv_b: Floats
+    a_inv_b: PathByCameras
     free: Floats
     blocks: Floats
 
@@ -55,7 +56,7 @@ def covariance(
     parts = eliminate(system)
     columns = problem.free_columns()
     information = parts.reduced
-    constraints = None
+    constraints = np.zeros((0, len(columns)))
     if problem.free_parameters.pose:
         prior_information = (
             np.zeros((len(state.cameras) * CAMERA_PARAMETERS,) * 2)
@@ -69,10 +70,7 @@ def covariance(
             constraints = gauge_constraints([camera.pose for camera in state.cameras], prior_information)[:, columns]
         if exact is not None:
             constraints = np.concatenate([constraints, exact[:, columns]])
-    free = np.zeros((0, 0))
-    if len(columns):
-        rows = np.zeros((0, len(columns))) if constraints is None else constraints
-        _, free = constrained_step(information, np.zeros(len(columns)), rows, np.zeros(len(rows)))
+    _, free = constrained_step(information, np.zeros(len(columns)), constraints, np.zeros(len(constraints)))
     width = len(state.cameras) * CAMERA_PARAMETERS
     full = np.zeros((width, width))
     full[np.ix_(columns, columns)] = free
@@ -87,13 +85,23 @@ def constrained_step(normal: Floats, right: Floats, rows: Floats, values: Floats
     if not len(rows):
         covariance: Floats = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         return covariance @ right, covariance
-    length = np.linalg.norm(rows, axis=1)
-    left, size, vt = np.linalg.svd(rows / length[:, None])
+    length, touched = np.linalg.norm(rows, axis=1), rows.any(axis=0)
+    left, size, short = np.linalg.svd(rows[:, touched] / length[:, None], full_matrices=False)
     rank = int(np.count_nonzero(size > 1e-9 * size[0]))
-    fixed = -vt[:rank].T @ ((left[:, :rank].T @ (values / length)) / size[:rank])
-    tangent = vt[rank:].T
+    vt = np.zeros((rank, rows.shape[1]))
+    vt[:, touched] = short[:rank]
+    fixed = -vt.T @ ((left[:, :rank].T @ (values / length)) / size[:rank])
+    tangent = _complement(vt)
     covariance = np.asarray(tangent @ np.linalg.inv(tangent.T @ normal @ tangent) @ tangent.T, dtype=np.float64)
     return fixed + covariance @ (right - normal @ fixed), covariance
+
+
+def _complement(fixed: Floats) -> csr_array[Any]:
+    """Orthonormal directions (p, p - q) perpendicular to ``fixed`` (q, p): parameters that it does not touch, alone."""
+    touched = fixed.any(axis=0)
+    places = np.concatenate([np.flatnonzero(~touched), np.flatnonzero(touched)])
+    mixed = np.linalg.svd(fixed[:, touched])[2][len(fixed) :].T
+    return csr_array(block_diag([eye_array(int((~touched).sum())), mixed]))[np.argsort(places)]
 
 
 def relative_rotation_stds(cameras: Floats, state: AdjustmentState) -> Floats:
@@ -103,14 +111,14 @@ def relative_rotation_stds(cameras: Floats, state: AdjustmentState) -> Floats:
     """
     count = len(state.cameras)
     out = np.zeros((count, count))
-    for i in range(count):
-        for j in range(i):
-            at = np.r_[i * CAMERA_PARAMETERS : i * CAMERA_PARAMETERS + 3]
-            to = np.r_[j * CAMERA_PARAMETERS : j * CAMERA_PARAMETERS + 3]
-            relative = state.cameras[i].pose.rotation @ state.cameras[j].pose.rotation.T
-            cross = cameras[np.ix_(at, to)] @ relative.T
-            between = cameras[np.ix_(at, at)] + relative @ cameras[np.ix_(to, to)] @ relative.T - cross - cross.T
-            out[i, j] = out[j, i] = float(np.sqrt(max(np.linalg.eigvalsh(between)[-1], 0.0)))
+    blocks = cameras.reshape(count, CAMERA_PARAMETERS, count, CAMERA_PARAMETERS)[:, :3, :, :3].transpose(0, 2, 1, 3)
+    own = np.array([blocks[i, i] for i in range(count)])
+    turned = np.array([camera.pose.rotation.T for camera in state.cameras])
+    for i in range(1, count):
+        relative = state.cameras[i].pose.rotation @ turned[:i]
+        cross = blocks[i, :i] @ relative.transpose(0, 2, 1)
+        between = own[i] + relative @ own[:i] @ relative.transpose(0, 2, 1) - cross - cross.transpose(0, 2, 1)
+        out[i, :i] = out[:i, i] = np.sqrt(np.maximum(np.linalg.eigvalsh(between)[:, -1], 0.0))
     return out
 
 
@@ -149,15 +157,14 @@ def time_map_std(cov: Covariance, state: AdjustmentState, camera: int, reference
     if camera == reference:
         return 0.0
     now, base = state.cameras[camera], state.cameras[reference]
-    row = np.zeros(len(cov.cameras))
-    row[camera * CAMERA_PARAMETERS + OFFSET] = 1.0
     at = float(base.camera_time(np.array([now.offset]))[0])
-    row[reference * CAMERA_PARAMETERS + OFFSET] -= 1.0
-    row[reference * CAMERA_PARAMETERS + RATE] -= at - base.centre
-    return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / base.rate)
+    of_reference = reference * CAMERA_PARAMETERS
+    columns = [camera * CAMERA_PARAMETERS + OFFSET, of_reference + OFFSET, of_reference + RATE]
+    row = np.array([1.0, -1.0, base.centre - at])
+    return float(np.sqrt(max(float(row @ cov.cameras[np.ix_(columns, columns)] @ row), 0.0)) / base.rate)
 
 
-def inner_constraints(a_inv_b: Floats, state: AdjustmentState, datum_points: list[tuple[int, Floats]]) -> Floats:
+def inner_constraints(a_inv_b: PathByCameras, state: AdjustmentState, datum_points: list[tuple[int, Floats]]) -> Floats:
     """(7, p) constraints over the free columns: the similarity fitted to the datum points does not move.
 
     The trajectory follows the cameras by -A^-1 B; the points' own noise averages out over many of them.
@@ -165,28 +172,28 @@ def inner_constraints(a_inv_b: Floats, state: AdjustmentState, datum_points: lis
     generators, jacobian = [], []
     for label, time in datum_points:
         path = state.trajectories[label]
-        base = 3 * sum(before.basis.size for before in state.trajectories[:label])
         index, weights, _ = path.basis.weights(time)
-        rows = base + 3 * (index[:, None] + np.arange(weights.shape[1]))
-        control = a_inv_b[rows[:, :, None] + np.arange(3)]
-        jacobian.append(-np.einsum("na,naip->nip", weights, control).reshape(-1, a_inv_b.shape[1]))
+        _, columns, part = a_inv_b.parts[label]
+        control = part[3 * (index[:, None] + np.arange(weights.shape[1]))[:, :, None] + np.arange(3)]
+        moved = np.zeros((3 * len(time), a_inv_b.width))
+        moved[:, columns] = -np.einsum("na,naip->nip", weights, control).reshape(len(moved), len(columns))
+        jacobian.append(moved)
         points = path.at(time)
         block = np.zeros((len(points), 3, 7))
         block[:, :, :3] = np.eye(3)
         block[:, :, 3:6] = -np.array([so3.hat(point) for point in points])
         block[:, :, 6] = points
         generators.append(block.reshape(-1, 7))
-    columns = np.concatenate(generators)
-    found = np.linalg.lstsq(columns / np.linalg.norm(columns, axis=0), np.concatenate(jacobian), rcond=None)[0]
+    along = np.concatenate(generators)
+    found = np.linalg.lstsq(along / np.linalg.norm(along, axis=0), np.concatenate(jacobian), rcond=None)[0]
     return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
 def clock_rate_std(cov: Covariance, state: AdjustmentState, camera: int, reference: int) -> float:
     """Std of the camera's clock rate relative to the reference camera's."""
-    row = np.zeros(len(cov.cameras))
-    row[camera * CAMERA_PARAMETERS + RATE] += 1.0
-    row[reference * CAMERA_PARAMETERS + RATE] -= 1.0
-    return float(np.sqrt(max(float(row @ cov.cameras @ row), 0.0)) / state.cameras[reference].rate)
+    columns = np.array([camera, reference]) * CAMERA_PARAMETERS + RATE
+    (own, shared), (_, other) = cov.cameras[np.ix_(columns, columns)]
+    return float(np.sqrt(max(own - 2.0 * shared + other, 0.0)) / state.cameras[reference].rate)
 
 
 def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentState) -> Floats:
@@ -195,35 +202,26 @@ def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentStat
     That is where their lag is used; away from it the uncertain rates increase the std. For cameras without a common
     span: in the middle of the gap. Diagonal 0.
     """
-    count, spans = len(state.cameras), _observed_spans(problem, state)
-    out = np.zeros((count, count))
-    for i, j in itertools.combinations(range(count), 2):
-        middle = _middle(spans[[i, j]])
-        of_rates = [(middle - now.offset) / now.rate for now in (state.cameras[i], state.cameras[j])]
-        row = np.array([1.0, of_rates[0], -1.0, -of_rates[1]])
-        columns = [camera * CAMERA_PARAMETERS + parameter for camera in (i, j) for parameter in (OFFSET, RATE)]
-        out[i, j] = out[j, i] = np.sqrt(max(float(row @ cov.cameras[np.ix_(columns, columns)] @ row), 0.0))
-    return out
+    middle = middles_of_overlap(problem, state)
+    offsets, rates = (np.array([getattr(camera, name) for camera in state.cameras]) for name in ("offset", "rate"))
+    change = (middle - offsets[:, None]) / rates[:, None]  # of a camera's (first index) map by its rate
+    both = ((OFFSET, OFFSET), (RATE, OFFSET), (RATE, RATE))
+    offset, mixed, rate = (cov.cameras[a::CAMERA_PARAMETERS, b::CAMERA_PARAMETERS] for a, b in both)
+    own = np.diag(offset)[:, None] + 2.0 * change * np.diag(mixed)[:, None] + change**2 * np.diag(rate)[:, None]
+    shared = offset + change * mixed + change.T * mixed.T + change * change.T * rate
+    variance = own + own.T - 2.0 * shared
+    np.fill_diagonal(variance, 0.0)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def middle_of_overlap(problem: Problem, state: AdjustmentState, first: int, second: int) -> Floats:
-    """Internal reference time (1,) in the middle of the common span of two cameras, or of the gap between them."""
-    return np.array([_middle(_observed_spans(problem, state)[[first, second]])])
-
-
-def _middle(spans: Floats) -> float:
-    """Of what spans (2, 2) have in common, or of the gap between them."""
-    return float(0.5 * (spans[:, 0].max() + spans[:, 1].min()))
-
-
-def _observed_spans(problem: Problem, state: AdjustmentState) -> Floats:
-    """First and last internal reference time (cameras, 2) of each camera's rows."""
-    out = np.tile([np.inf, -np.inf], (len(state.cameras), 1))
+def middles_of_overlap(problem: Problem, state: AdjustmentState) -> Floats:
+    """Internal reference time (cameras, cameras) in the middle of the common span of two, or of the gap between."""
+    first, last = np.full(len(state.cameras), np.inf), np.full(len(state.cameras), -np.inf)
     for part in problem.rows:
-        if len(part.time):
-            times = state.cameras[part.camera].reference_time(part.time)
-            out[part.camera] = min(out[part.camera, 0], times.min()), max(out[part.camera, 1], times.max())
-    return out
+        times = state.cameras[part.camera].reference_time(part.time)
+        first[part.camera] = times.min(initial=first[part.camera])
+        last[part.camera] = times.max(initial=last[part.camera])
+    return np.asarray(0.5 * (np.maximum(first[:, None], first) + np.minimum(last[:, None], last)))
 
 
 def position_std(cov: Covariance, camera: int) -> Floats:
@@ -236,9 +234,10 @@ def position_std(cov: Covariance, camera: int) -> Floats:
 
 def path_std(cov: Covariance, state: AdjustmentState, label: int, time: Floats) -> Floats:
     """Std (n,) of a path at internal reference times (n,): one for three axes, see `equivalent_std`."""
-    base = 3 * sum(path.basis.size for path in state.trajectories[:label])
     index, weights, _ = state.trajectories[label].basis.weights(time)
-    first = base + 3 * index
+    rows, columns, by_cameras = cov.a_inv_b.parts[label]
+    free = cov.free[np.ix_(columns, columns)]
+    first = rows.start + 3 * index
     block, inside = first // BAND, first % BAND
     out = np.zeros((len(time), 3))
     for axis in range(3):
@@ -246,9 +245,8 @@ def path_std(cov: Covariance, state: AdjustmentState, label: int, time: Floats) 
             for b in range(SUPPORT):
                 values = cov.blocks[block, inside + 3 * a + axis, inside + 3 * b + axis]
                 out[:, axis] += weights[:, a] * weights[:, b] * values
-        sensitivity = cov.a_inv_b[base + axis : base + 3 * state.trajectories[label].basis.size : 3]
-        a_inv_b = weighted_sums(sensitivity, index, weights)
-        out[:, axis] += ((a_inv_b @ cov.free) * a_inv_b).sum(axis=1)
+        a_inv_b = weighted_sums(by_cameras[axis::3], index, weights)
+        out[:, axis] += ((a_inv_b @ free) * a_inv_b).sum(axis=1)
     return equivalent_std(np.sqrt(np.maximum(out, 0.0)))
 
 

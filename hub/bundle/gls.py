@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.bundle.adjustment import apply_step, gauge_tangent
+from hub.bundle.adjustment import apply_step, gauge
 from hub.bundle.bordered_system import PathBlocks, add_row_sums
 from hub.bundle.covariance import constrained_step
 from hub.bundle.datum.gauge import ControlPointTerms
@@ -94,7 +94,7 @@ def solve_gls(
 
     control_terms, constraints: normal equations of the control points with a std at a state, and constraints (rows,
     values; see `covariance.constrained_step`) of the others and of the gauge; without them the gauge is fixed
-    (`adjustment.gauge_tangent`). Rows that are off the trajectory at ``state``, and a camera's only row of a label, are
+    (`adjustment.gauge`). Rows that are off the trajectory at ``state``, and a camera's only row of a label, are
     left out. Stops after forty steps at the latest. Raises LinAlgError where the rows do not determine a trajectory.
     """
     problem = _on_trajectory(problem, state)
@@ -281,14 +281,13 @@ def _step(
     solution = _solve_banded(entries, _time_order(state, parts), np.column_stack([border, gradient]))
     reduced, right_side = corner - border.T @ solution[:, :-1], border.T @ solution[:, -1] - camera_gradient
     if constraints is None:
-        tangent = gauge_tangent(problem, state)
-        free = np.eye(len(columns)) if tangent is None else tangent
-        covariance = free @ np.linalg.inv(free.T @ reduced @ free) @ free.T if len(columns) else reduced
-        cameras, must = covariance @ right_side, False
+        fixed = gauge(problem, state)
+        values = np.zeros(len(fixed))
     else:
-        fixed, values = constraints(state)
-        cameras, covariance = constrained_step(reduced, right_side, fixed[:, columns], values)
-        must = bool(np.abs(values).max(initial=0.0) > _ON_CONSTRAINTS)
+        directions, values = constraints(state)
+        fixed = directions[:, columns]
+    cameras, covariance = constrained_step(reduced, right_side, fixed, values)
+    must = bool(np.abs(values).max(initial=0.0) > _ON_CONSTRAINTS)
     return -(solution[:, -1] + solution[:, :-1] @ cameras)[:paths], cameras, covariance, must
 
 

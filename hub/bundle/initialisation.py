@@ -72,6 +72,31 @@ class Reconstruction:
     state: AdjustmentState
 
 
+class _Triangulated:
+    """Trajectories by linear triangulation, and when they are observed; kept while their cameras do not move."""
+
+    def __init__(self, cameras: dict[str, CameraInput], labels: list[str]) -> None:
+        self._cameras = cameras
+        self._seeing = {label: [name for name, camera in cameras.items() if label in camera.tracks] for label in labels}
+        self._paths: dict[str, tuple[list[CameraState], Trajectory | None]] = {}
+        self._times: dict[str, tuple[Trajectory, list[Floats]]] = {}
+
+    def path(self, label: str, placed: dict[str, CameraState]) -> Trajectory | None:
+        """The trajectory of a label from the placed cameras."""
+        names = [name for name in self._seeing[label] if name in placed]
+        states = [placed[name] for name in names]
+        if label not in self._paths or self._paths[label][0] != states:  # the same objects
+            self._paths[label] = states, triangulate_label(names, states, self._cameras, label)
+        return self._paths[label][1]
+
+    def times(self, reconstruction: Reconstruction, number: int) -> list[Floats]:
+        """`observation_times` of a label of the reconstruction."""
+        label, path = reconstruction.labels[number], reconstruction.state.trajectories[number]
+        if label not in self._times or self._times[label][0] is not path:
+            self._times[label] = path, observation_times(reconstruction.problem, reconstruction.state, number)
+        return self._times[label][1]
+
+
 def reconstruct_incrementally(
     cameras: dict[str, CameraInput],
     graph: ClockGraph,
@@ -107,16 +132,23 @@ def place_cameras(
     refused: dict[str, str] = {}
     first, second = [name for name in cameras if name in placed][:2]
     anchors = anchors or (first, second)
-    reconstruction = triangulate_and_adjust(cameras, placed, rows, labels, anchors, free_parameters)
+    kept = _Triangulated(cameras, labels)
+    reconstruction = triangulate_and_adjust(cameras, placed, rows, labels, anchors, free_parameters, kept)
     adjusted = len(placed)
     unplaced = [name for name in graph.clocks if name not in placed]
+    scores: dict[str, tuple[tuple[object, ...], float]] = {}  # and what each depends on
     while unplaced:
-        spreads = {name: _resection_score(cameras[name], graph, reconstruction) for name in unplaced}
-        name = max(unplaced, key=spreads.__getitem__)
+        paths = dict(zip(reconstruction.labels, reconstruction.state.trajectories, strict=True))
+        reference = reconstruction.state.cameras[reconstruction.problem.clock_reference]
+        for name in unplaced:
+            depends = (reference, *map(paths.get, cameras[name].tracks))
+            if name not in scores or scores[name][0] != depends:
+                scores[name] = depends, _resection_score(cameras[name], graph, reconstruction, kept)
+        name = max(unplaced, key=lambda one: scores[one][1])
         unplaced.remove(name)
         if progress is not None:
             progress(f"placing {name}")
-        state = _resect(cameras[name], graph, reconstruction) or _intersect_bearings(
+        state = _resect(cameras[name], graph, reconstruction, kept) or _intersect_bearings(
             cameras[name], graph, reconstruction
         )
         if state is None:
@@ -129,12 +161,12 @@ def place_cameras(
         # The cost grows with the network: a large one is adjusted only when it has grown by a third.
         adjust_now = len(current) <= _SMALL_NETWORK or len(current) >= _ADJUST_GROWTH * adjusted or not unplaced
         reconstruction = triangulate_and_adjust(
-            cameras, current, rows, labels, anchors, free_parameters if adjust_now else None
+            cameras, current, rows, labels, anchors, free_parameters if adjust_now else None, kept
         )
         adjusted = len(current) if adjust_now else adjusted
     if adjusted < len(reconstruction.names):
         placed = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
-        reconstruction = triangulate_and_adjust(cameras, placed, rows, labels, anchors, free_parameters)
+        reconstruction = triangulate_and_adjust(cameras, placed, rows, labels, anchors, free_parameters, kept)
     return reconstruction, refused
 
 
@@ -182,19 +214,22 @@ def triangulate_and_adjust(
     labels: list[str],
     anchors: tuple[str, str],
     free_parameters: FreeParameters | None,
+    kept: _Triangulated | None = None,
 ) -> Reconstruction:
     """Triangulate trajectories from the placed cameras and adjust briefly. Raises Refused without any trajectory."""
-    names = [name for name in cameras if name in placed]
+    kept = kept or _Triangulated(cameras, labels)
+    numbers = {name: number for number, name in enumerate(name for name in cameras if name in placed)}
+    names = list(numbers)
     states = [placed[name] for name in names]
     trajectories, used = [], []
     for label in range(len(labels)):
-        path = triangulate_label(names, states, cameras, labels[label])
+        path = kept.path(labels[label], placed)
         if path is not None:
             trajectories.append(path)
             used.append(label)
     new_label = {label: i for i, label in enumerate(used)}
     used_rows = tuple(
-        replace(part, camera=names.index(name), label=new_label[part.label])
+        replace(part, camera=numbers[name], label=new_label[part.label])
         for name in names
         for part in rows[name]
         if part.label in new_label
@@ -202,8 +237,8 @@ def triangulate_and_adjust(
     problem = Problem(
         rows=used_rows,
         nominal=tuple(cameras[name].intrinsics for name in names),
-        clock_reference=names.index(anchors[0]),
-        anchors=(names.index(anchors[0]), names.index(anchors[1])),
+        clock_reference=numbers[anchors[0]],
+        anchors=(numbers[anchors[0]], numbers[anchors[1]]),
         free_parameters=free_parameters or FreeParameters(),
         lens_priors=tuple(cameras[name].lens_prior for name in names),
         readout_given=tuple(cameras[name].readout_given for name in names),
@@ -321,7 +356,9 @@ def linear_triangulation(
     return points, good
 
 
-def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: Reconstruction) -> tuple[Floats, Floats]:
+def _resection_points(
+    camera: CameraInput, clock: CameraState, reconstruction: Reconstruction, kept: _Triangulated
+) -> tuple[Floats, Floats]:
     """3D-2D correspondences of a camera with the trajectories: positions (n, 3) and normalised points (n, 2)."""
     positions, seen = [], []
     for number, path in enumerate(reconstruction.state.trajectories):
@@ -330,8 +367,7 @@ def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: R
             continue
         time = clock.reference_time(track.time)
         where = path.at(time)
-        observed = observation_times(reconstruction.problem, reconstruction.state, number)
-        both = np.isfinite(where).all(axis=1) & seen_by_two(observed, time)
+        both = np.isfinite(where).all(axis=1) & seen_by_two(kept.times(reconstruction, number), time)
         positions.append(where[both])
         seen.append(track.points[both])
     if not positions:
@@ -341,12 +377,11 @@ def _resection_points(camera: CameraInput, clock: CameraState, reconstruction: R
 
 def observation_times(problem: Problem, state: AdjustmentState, label: int) -> list[Floats]:
     """Sorted internal times at which a label is observed, by camera that observes it."""
-    out = []
-    for number, camera in enumerate(state.cameras):
-        seen = [rows.time[rows.use] for rows in problem.rows if rows.camera == number and rows.label == label]
-        if sum(map(len, seen)):
-            out.append(np.sort(camera.reference_time(np.concatenate(seen))))
-    return out
+    seen: dict[int, list[Floats]] = {}
+    for rows in problem.rows:
+        if rows.label == label and rows.use.any():
+            seen.setdefault(rows.camera, []).append(rows.time[rows.use])
+    return [np.sort(state.cameras[number].reference_time(np.concatenate(seen[number]))) for number in sorted(seen)]
 
 
 def seen_by_two(
@@ -364,11 +399,13 @@ def seen_by_two(
     return count >= 2
 
 
-def _resection_score(camera: CameraInput, graph: ClockGraph, reconstruction: Reconstruction) -> float:
+def _resection_score(
+    camera: CameraInput, graph: ClockGraph, reconstruction: Reconstruction, kept: _Triangulated
+) -> float:
     """Score of a camera for resection: number of common points times their deviation from a plane."""
     clock = _camera_state(camera, graph, Pose.identity())
     moved = _on_reconstruction_clock(clock, graph, reconstruction)
-    positions, _ = _resection_points(camera, moved, reconstruction)
+    positions, _ = _resection_points(camera, moved, reconstruction, kept)
     if len(positions) < _MIN_PNP_POINTS:
         return float(len(positions))
     spread = np.linalg.svd(positions - positions.mean(0), compute_uv=False)
@@ -383,10 +420,12 @@ def _on_reconstruction_clock(clock: CameraState, graph: ClockGraph, reconstructi
     return replace(clock, rate=clock.rate * rate, offset=(clock.offset - then.offset) * rate + now.offset)
 
 
-def _resect(camera: CameraInput, graph: ClockGraph, reconstruction: Reconstruction) -> CameraState | None:
+def _resect(
+    camera: CameraInput, graph: ClockGraph, reconstruction: Reconstruction, kept: _Triangulated
+) -> CameraState | None:
     """Pose of one more camera by resection against the trajectories (PnP with RANSAC, OpenCV)."""
     clock = _on_reconstruction_clock(_camera_state(camera, graph, Pose.identity()), graph, reconstruction)
-    positions, seen = _resection_points(camera, clock, reconstruction)
+    positions, seen = _resection_points(camera, clock, reconstruction, kept)
     if len(positions) < _MIN_PNP_POINTS:
         return None
     sample = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_PNP_POINTS)).round().astype(np.int64)
@@ -438,19 +477,19 @@ def _intersect_bearings(camera: CameraInput, graph: ClockGraph, reconstruction: 
     )
 
 
-def sigma_limits(state: AdjustmentState) -> Floats:
-    """(cameras,) noise of one pixel coordinate that a camera that fits has at most: thrice the others' median."""
-    return np.array([3.0 * float(np.median(np.delete(state.sigma, i))) for i in range(len(state.sigma))])
+def sigma_limit(state: AdjustmentState, camera: int) -> float:
+    """Noise of one pixel coordinate that a camera that fits has at most: thrice the others' median."""
+    return 3.0 * float(np.median(np.delete(state.sigma, camera)))
 
 
 def inlier_share(reconstruction: Reconstruction, name: str) -> tuple[float, int]:
     """Share of a placed camera's rows that fit the trajectories within 5 sigma or 3 px, and how many rows there are.
 
-    The sigma of a camera that saw something else is inflated by its own residuals: it is limited by `sigma_limits`.
+    The sigma of a camera that saw something else is inflated by its own residuals: it is limited by `sigma_limit`.
     """
     number = reconstruction.names.index(name)
     state = reconstruction.state
-    sigma = min(float(state.sigma[number]), float(sigma_limits(state)[number]))
+    sigma = min(float(state.sigma[number]), sigma_limit(state, number))
     norms = [
         residual_norms(rows, reconstruction.state.cameras[number], reconstruction.state.trajectories[rows.label])
         for rows in reconstruction.problem.rows

@@ -16,9 +16,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from hub.bundle.adjustment import apply_step, estimate_noise, gauge_tangent
-from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, cho_solve_path, eliminate
+from hub.bundle.adjustment import apply_step, estimate_noise, gauge
+from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, eliminate
 from hub.bundle.correlated_noise import MIN_INFLATION, lens_tolerance
+from hub.bundle.covariance import constrained_step
 from hub.bundle.gauss_markov import estimate_correlated_noise
 from hub.bundle.noise_scale import correlation_inflation, modelled_inflation
 from hub.bundle.normal_equations import build_system
@@ -96,21 +97,21 @@ def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[ScoreTest]:
         camera: np.flatnonzero(np.isin(columns, camera * CAMERA_PARAMETERS + np.array([FOCAL, K1]))) for camera in given
     }
     limit = float(chdtri(2, _FALSE_ALARM_PROBABILITY / len(given)))
-    return _forward_selection(normal, gradient, gauge_tangent(freed, state), lens, limit)
+    return _forward_selection(normal, gradient, gauge(freed, state), lens, limit)
 
 
 def _forward_selection(
-    normal: Floats, gradient: Floats, tangent: Floats | None, candidates: dict[int, Ints], limit: float
+    normal: Floats, gradient: Floats, fixed: Floats, candidates: dict[int, Ints], limit: float
 ) -> list[ScoreTest]:
     """Tests of the cameras whose parameters, freed one after the other, lower the cost by more than ``limit`` each.
 
-    normal (p, p), gradient (p,): of all parameters. tangent: (p, q) directions that keep the gauge. candidates: each
+    normal (p, p), gradient (p,): of all parameters. fixed: (q, p) directions of the gauge. candidates: each
     camera's columns; all other columns are free.
     """
     kept = np.setdiff1d(np.arange(len(gradient)), np.concatenate([np.zeros(0, dtype=np.int64), *candidates.values()]))
     out: list[ScoreTest] = []
     while len(out) < len(candidates):
-        _, step, covariance = _reduction(normal, gradient, tangent, kept)
+        step, covariance = _reduction(normal, gradient, fixed, kept)
         found = []
         for camera in candidates.keys() - {one.camera for one in out}:
             # What some parameters more lower the cost by: one step of them beside all others (Schur complement).
@@ -139,7 +140,7 @@ def with_crystal_rates(problem: Problem, state: AdjustmentState) -> Problem:
     inflation = correlation_inflation(problem, state)
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
     columns, normal, gradient = _reduced_system(wide, noisy, estimate_smoothness(problem, state))
-    covariance = _reduction(normal, gradient, gauge_tangent(wide, state), np.arange(len(columns)))[2]
+    covariance = _reduction(normal, gradient, gauge(wide, state), np.arange(len(columns)))[1]
     variance = dict(zip(columns.tolist(), np.diag(covariance).tolist(), strict=True))
     reference = state.cameras[problem.clock_reference].rate
     crystal = tuple(
@@ -159,8 +160,8 @@ def are_readouts_observable(problem: Problem, state: AdjustmentState) -> bool:
         _in_its_noise(*weighted_by_jitter(problem, state)),
         _evidence_needed(problem, 1, len(state.cameras)),
     )
-    tangent = gauge_tangent(linear.problem, state)
-    return bool(_forward_selection(linear.parts.reduced, linear.gradient, tangent, linear.readouts(), needed))
+    fixed = gauge(linear.problem, state)
+    return bool(_forward_selection(linear.parts.reduced, linear.gradient, fixed, linear.readouts(), needed))
 
 
 def with_free_readouts(problem: Problem) -> Problem:
@@ -212,22 +213,22 @@ def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessP
     """Free columns (p,), normal matrix (p, p) and gradient (p,) of the camera parameters, the paths eliminated."""
     system, _ = build_system(problem, state, prior, robust=False)
     parts = eliminate(system)
-    gradient = system.gradient_cameras - system.border.T @ cho_solve_path(parts, system.gradient_path)
+    gradient = system.gradient_cameras - system.border.transposed_times(
+        cho_solve_banded(parts.factor, system.gradient_path)
+    )
     return problem.free_columns(), parts.reduced, gradient
 
 
-def _reduction(normal: Floats, gradient: Floats, tangent: Floats | None, kept: Ints) -> tuple[float, Floats, Floats]:
-    """Predicted decrease of the cost in one step of the parameters ``kept``, the step (p,) and its covariance (p, p).
+def _reduction(normal: Floats, gradient: Floats, fixed: Floats, kept: Ints) -> tuple[Floats, Floats]:
+    """One step (p,) of the parameters ``kept``, and its covariance (p, p).
 
-    tangent: (p, q) directions that keep the gauge, which fixes poses only.
+    fixed: (q, p) directions of the gauge, of poses only.
     """
-    directions: Floats = np.eye(len(gradient)) if tangent is None else tangent
-    others = np.setdiff1d(np.arange(len(gradient)), kept)
-    if len(others):
-        directions = directions @ np.linalg.svd(directions[others])[2][len(others) :].T
-    covariance = directions @ np.linalg.solve(directions.T @ normal @ directions, directions.T)
-    step = -covariance @ gradient
-    return float(-gradient @ step), step, covariance
+    step, covariance = np.zeros_like(gradient), np.zeros_like(normal)
+    step[kept], covariance[np.ix_(kept, kept)] = constrained_step(
+        normal[np.ix_(kept, kept)], -gradient[kept], fixed[:, kept], np.zeros(len(fixed))
+    )
+    return step, covariance
 
 
 def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | None:
@@ -375,11 +376,10 @@ class _Linearised:
         prior = replace(prior, weights=tuple(share * weight for weight in prior.weights))
         system, _ = build_system(wide, noisy, prior, robust=False)
         parts = eliminate(system)
-        path = cho_solve_path(parts, system.gradient_path)
-        tangent = gauge_tangent(wide, state)
-        directions: Floats = np.eye(len(system.gradient_cameras)) if tangent is None else tangent
-        covariance = directions @ np.linalg.solve(directions.T @ parts.reduced @ directions, directions.T)
-        return cls(wide, noisy, system, parts, path, system.gradient_cameras - system.border.T @ path, covariance)
+        path = cho_solve_banded(parts.factor, system.gradient_path)
+        gradient, fixed = system.gradient_cameras - system.border.transposed_times(path), gauge(wide, state)
+        _, covariance = constrained_step(parts.reduced, gradient, fixed, np.zeros(len(fixed)))
+        return cls(wide, noisy, system, parts, path, gradient, covariance)
 
     def readouts(self) -> dict[int, Ints]:
         """The column (1,) of each camera's readout that was not given."""
@@ -406,7 +406,7 @@ class _Linearised:
         corner = np.zeros((len(columns), len(times)))
         corner[mine] = cross[4:] @ after.T
         solved = cho_solve_banded(self.parts.factor, border)
-        coupling = corner - system.border.T @ solved
+        coupling = corner - system.border.transposed_times(solved)
         score = after @ (weighted * seen.whitened(seen.residual)).sum(axis=0) - solved.T @ system.gradient_path
         score -= coupling.T @ (self.covariance @ self.gradient)
         information = after @ cross[3] - (border * solved).sum(axis=0)

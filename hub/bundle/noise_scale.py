@@ -63,20 +63,21 @@ def _hat_matrix_trace(problem: Problem, state: AdjustmentState, found: Covarianc
     use = np.zeros_like(rows.use)
     use[pick] = True
     line = linearise(rows.using(use), state.cameras[rows.camera], state.trajectories[rows.label], CAMERA_PARAMETERS)
-    base = 3 * sum(path.basis.size for path in state.trajectories[: rows.label])
-    first = base + 3 * line.index
+    rows_of_label, columns, by_cameras = found.a_inv_b.parts[rows.label]
+    first = rows_of_label.start + 3 * line.index
     inside = (first % BAND)[:, None] + np.arange(BAND)
     blocks = found.blocks[(first // BAND)[:, None, None], inside[:, :, None], inside[:, None, :]]
     w, n = line.weights, len(line.index)
     point = np.einsum("na,naibj,nb->nij", w, blocks.reshape(n, SUPPORT, 3, SUPPORT, 3), w, optimize=True)
     trace = float(np.einsum("npi,nij,npj->", line.point_jacobian, point, line.point_jacobian, optimize=True))
     if found.free.size:
-        sensitivity = found.a_inv_b[first[:, None] + np.arange(BAND)].reshape(n, SUPPORT, 3, -1)
+        sensitivity = by_cameras[3 * line.index[:, None] + np.arange(BAND)].reshape(n, SUPPORT, 3, len(columns))
         shift = -line.point_jacobian @ np.einsum("na,naip->nip", w, sensitivity)
-        columns = problem.free_columns()
-        camera_columns = np.flatnonzero(columns // CAMERA_PARAMETERS == rows.camera)
-        shift[:, :, camera_columns] += line.camera_jacobian[:, :, columns[camera_columns] % CAMERA_PARAMETERS]
-        trace += float(np.einsum("npi,ij,npj->", shift, found.free, shift, optimize=True))
+        parameters = problem.free_columns()[columns]
+        own = np.flatnonzero(parameters // CAMERA_PARAMETERS == rows.camera)
+        shift[:, :, own] += line.camera_jacobian[:, :, parameters[own] % CAMERA_PARAMETERS]
+        free = found.free[np.ix_(columns, columns)]
+        trace += float(np.einsum("npi,ij,npj->", shift, free, shift, optimize=True))
     return trace / float(state.sigma[rows.camera]) ** 2 * len(used) / len(pick)
 
 

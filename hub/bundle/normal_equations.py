@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from hub.bundle.bordered_system import BorderedSystem, PathBlocks
+from hub.bundle.bordered_system import BAND, BorderedSystem, PathBlocks, PathByCameras
 from hub.bundle.problem import (
     ASPECT,
     CAMERA_PARAMETERS,
@@ -84,35 +85,41 @@ def assemble(
     problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, residuals: WeightedResiduals
 ) -> BorderedSystem:
     """The normal equations at a state whose rows are ``residuals``."""
-    scatters = [3 * path.basis.size for path in state.trajectories]
-    first_columns = np.r_[0, np.cumsum(scatters)].astype(int)
+    first_rows = np.r_[0, np.cumsum([3 * path.basis.size for path in state.trajectories])].astype(int)
     columns = problem.free_columns()
-    system = BorderedSystem(
-        np.zeros((12, first_columns[-1])),
-        np.zeros((first_columns[-1], len(columns)), order="F"),  # LAPACK's layout
-        np.zeros((len(columns), len(columns))),
-        np.zeros(first_columns[-1]),
-        np.zeros(len(columns)),
-    )
-    blocks = PathBlocks(first_columns[-1] // 3)
+    corner, gradient_cameras = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+    band, gradient_path = np.zeros((BAND, first_rows[-1])), np.zeros(first_rows[-1])
+    blocks = [PathBlocks(path.basis.size) for path in state.trajectories]
+    border: list[dict[int, Floats]] = [{} for _ in blocks]
+    columns_of = {camera: np.flatnonzero(columns // CAMERA_PARAMETERS == camera) for camera in residuals.cameras}
     for camera, one, weight in zip(residuals.cameras, residuals.evaluations, residuals.weights, strict=True):
-        camera_columns = np.flatnonzero(columns // CAMERA_PARAMETERS == camera)
-        jacobian = jacobians(one, state.cameras[camera], (columns[camera_columns] % CAMERA_PARAMETERS).tolist())
-        terms, root = np.empty((2, jacobian.shape[1] + 1, len(weight))), np.sqrt(weight)
-        np.multiply(jacobian, root, out=terms[:, :-1])
-        np.multiply(one.whitened(one.residual), root, out=terms[:, -1])
-        path_terms, camera_terms = blocks.add_rows(one.index, one.weights, terms)
-        system.gradient_path += path_terms[:, -1]
-        if len(camera_columns):
-            system.border[:, camera_columns[0] : camera_columns[-1] + 1] = path_terms[:, :-1]
-            system.corner[np.ix_(camera_columns, camera_columns)] = camera_terms[:-1, :-1]
-            system.gradient_cameras[camera_columns] = camera_terms[:-1, -1]
-    system.band += blocks.band()
+        own = columns_of[camera]
+        jacobian = jacobians(one, state.cameras[camera], (columns[own] % CAMERA_PARAMETERS).tolist())
+        residual = one.whitened(one.residual)
+        root, labels = np.sqrt(weight), np.searchsorted(first_rows, 3 * one.index, side="right") - 1
+        edges = [0, *(np.flatnonzero(np.diff(labels)) + 1).tolist(), len(labels)]
+        for begin, end in pairwise(edges) if len(labels) else ():
+            label, part = int(labels[begin]), slice(begin, end)
+            terms = np.empty((2, jacobian.shape[1] + 1, end - begin))
+            np.multiply(jacobian[:, :, part], root[part], out=terms[:, :-1])
+            np.multiply(residual[:, part], root[part], out=terms[:, -1])
+            index = one.index[part] - first_rows[label] // 3
+            path_terms, camera_terms = blocks[label].add_rows(index, one.weights[part], terms)
+            gradient_path[first_rows[label] : first_rows[label + 1]] += path_terms[:, -1]
+            before = border[label].get(camera)
+            border[label][camera] = path_terms[:, :-1] if before is None else before + path_terms[:, :-1]
+            corner[np.ix_(own, own)] += camera_terms[:-1, :-1]
+            gradient_cameras[own] += camera_terms[:-1, -1]
+    parts = []
     for label, path in enumerate(state.trajectories):
-        part = slice(first_columns[label], first_columns[label + 1])
-        band, gradient, _ = smoothness_terms(path, *prior.of(label))
-        system.band[:, part] += band
-        system.gradient_path[part] += gradient
+        rows_of_label = slice(int(first_rows[label]), int(first_rows[label + 1]))
+        of_prior, gradient, _ = smoothness_terms(path, *prior.of(label))
+        band[:, rows_of_label] = blocks[label].band() + of_prior
+        gradient_path[rows_of_label] += gradient
+        seeing = [np.zeros(0, dtype=np.int64), *(columns_of[camera] for camera in border[label])]
+        block = np.concatenate([np.zeros((len(gradient), 0)), *border[label].values()], axis=1)
+        parts.append((rows_of_label, np.concatenate(seeing), block))
+    system = BorderedSystem(band, PathByCameras(tuple(parts), len(columns)), corner, gradient_path, gradient_cameras)
     column_index = {int(column): i for i, column in enumerate(columns)}
     for column, value, std in camera_priors(problem, state):
         if column in column_index:

@@ -9,7 +9,7 @@ import numpy as np
 from hub.bundle import model_comparison
 from hub.bundle.adjustment import adjust
 from hub.bundle.correlated_noise import refit_with_correlated_noise
-from hub.bundle.initialisation import Reconstruction, sigma_limits
+from hub.bundle.initialisation import Reconstruction, sigma_limit
 from hub.bundle.noise_scale import correlation_inflation
 from hub.bundle.problem import AdjustmentState, ClockStep, Problem
 from hub.bundle.residuals import residual_norms
@@ -93,7 +93,7 @@ def final_adjustment(
         refitted = _refit_online(problem, state, refine_lenses)
         if refitted[1] is not state:
             return replace(reconstruction, problem=refitted[0], state=refitted[1])
-    if not online and np.any(state.sigma > sigma_limits(state)):
+    if not online and any(one > sigma_limit(state, camera) for camera, one in enumerate(state.sigma)):
         lens, step = wrong_lens(problem, state), model_comparison.find_clock_step(problem, state)
         if lens is not None and (step is None or step.statistic < lens.statistic):
             return reconstruction  # the camera will be left out

@@ -58,10 +58,9 @@ def sensitivities(
         freed = replace(problem, free_parameters=replace(free, lens=True))
         normal, columns = eliminate(build_system(freed, state, prior, robust=False)[0]).reduced, freed.free_columns()
         rows = np.searchsorted(columns, base)
-        covariance = found.cameras[:, base]
-        for i in held:
-            focal = int(np.searchsorted(columns, i * CAMERA_PARAMETERS + FOCAL))
-            lenses[i] = -covariance @ normal[rows, focal] * _LENS_STD
+        focal = np.searchsorted(columns, np.array(held) * CAMERA_PARAMETERS + FOCAL)
+        changes = -found.cameras[:, base] @ normal[np.ix_(rows, focal)] * _LENS_STD
+        lenses = dict(zip(held, changes.T, strict=True))
     out: list[tuple[Sensitivity, ...]] = []
     for i, name in enumerate(names):
         camera, mine = rig.cameras[name], list[Sensitivity]()

@@ -102,10 +102,8 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         time_at_centre = float(reference_at_centre / time_scales[reference] + time_origins[reference])
         maps.append(TimeMap(rate, time_at_centre - rate * (camera.centre / time_scale + time_origin)))
     maps[reference] = TimeMap(1.0, 0.0)
-    lag_times = [
-        float(camera.camera_time(cov.middle_of_overlap(problem, state, i, reference))[0])
-        for i, camera in enumerate(state.cameras)
-    ]
+    middles = cov.middles_of_overlap(problem, state)
+    lag_times = [float(camera.camera_time(middles[i, [reference]])[0]) for i, camera in enumerate(state.cameras)]
     # Of the maps onto the reference camera's clock, in the middle of their common span.
     lag_stds = [
         _with_step_errors(std / base.rate, problem, state, i, reference)
@@ -155,7 +153,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         trajectories=_tables(
             rig, solution.prepared, names, reconstruction.labels, problem, state, covariance, reference
         ),
-        pairs=tuple(_pair_report(pair, cameras, problem, state, names, solution) for pair in solution.pairs),
+        pairs=tuple(_pair_report(pair, cameras, middles, state, names, solution) for pair in solution.pairs),
         warnings=solution.prepared.warnings
         + solution.warnings
         + control_outliers
@@ -420,7 +418,7 @@ def _tables(
 def _pair_report(
     pair: PairSolution,
     cameras: dict[str, CameraCalibration],
-    problem: Problem,
+    middles: Floats,
     state: AdjustmentState,
     names: list[str],
     solution: Solution,
@@ -428,8 +426,8 @@ def _pair_report(
     """Report of a pair: from the joint solution where both cameras are in it, else from the pair's own solution."""
     fit = pair.fit
     a, b = cameras.get(pair.a), cameras.get(pair.b)
-    middle = _middle_of_overlap(problem, state, names, pair)
-    if pair.fundamental is None and a is not None and b is not None and middle is not None:
+    if pair.fundamental is None and a is not None and b is not None:
+        middle = float(middles[names.index(pair.a), names.index(pair.b)])
         time_a, time_b = (_camera_clock(state, names, name, middle, solution) for name in (pair.a, pair.b))
         relative = relative_pose_between(a.pose, b.pose)
         return PairReport(
@@ -471,18 +469,3 @@ def _camera_clock(state: AdjustmentState, names: list[str], name: str, internal:
     prepared = solution.prepared
     observed = float(state.cameras[names.index(name)].camera_time(np.array([internal]))[0])
     return observed / prepared.time_scale(name) + prepared.time_origins[name]
-
-
-def _middle_of_overlap(problem: Problem, state: AdjustmentState, names: list[str], pair: PairSolution) -> float | None:
-    spans = []
-    for name in (pair.a, pair.b):
-        if name not in names:
-            return None
-        number = names.index(name)
-        times = [r.time[r.use] for r in problem.rows if r.camera == number]
-        joined = np.concatenate(times) if times else np.zeros(0)
-        if not len(joined):
-            return None
-        spans.append(state.cameras[number].reference_time(np.array([joined.min(), joined.max()])))
-    begin, end = max(spans[0][0], spans[1][0]), min(spans[0][1], spans[1][1])
-    return float(0.5 * (begin + end))

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import splu
 
 from hub.sync.hypothesis import PairSolution, evidence
 from hub.trajectory.image_tracks import ImageTrack
@@ -88,7 +90,7 @@ def _solve_time_maps(
     count = len(names)
     index = {name: i for i, name in enumerate(names)}
     # Unknowns: offset and rate less 1 per camera. Rows: time agreement at two times around the overlap.
-    rows, right, owner, base_weight = [], [], [], []
+    entries, right, owner, base_weight = list[tuple[int, int, float]](), list[float](), list[int](), list[float]()
     for number, pair in enumerate(pairs):
         fit = pair.fit
         if fit is None:
@@ -96,33 +98,26 @@ def _solve_time_maps(
         a, b = index[pair.a], index[pair.b]
         middle = fit.mid_time
         for time_a in (middle - _RATE_BASELINE / 2, middle + _RATE_BASELINE / 2):
-            time_b = (time_a - fit.offset) / fit.rate
-            row = np.zeros(2 * count)
-            row[2 * a], row[2 * a + 1] = 1.0, time_a - centres[pair.a]
-            row[2 * b], row[2 * b + 1] = -1.0, -(time_b - centres[pair.b])
-            rows.append(row)
-            right.append(-(time_a - centres[pair.a]) + (time_b - centres[pair.b]))
+            since_a, since_b = time_a - centres[pair.a], (time_a - fit.offset) / fit.rate - centres[pair.b]
+            row = {2 * a: 1.0, 2 * a + 1: since_a, 2 * b: -1.0, 2 * b + 1: -since_b}
+            entries += [(len(right), column, value) for column, value in row.items()]
+            right.append(since_b - since_a)
             owner.append(number)
             base_weight.append(np.sqrt(max(evidence(fit), 1e-3)) / _LAG_STD)
     for i in range(count):  # rates near nominal
-        row = np.zeros(2 * count)
-        row[2 * i + 1] = 1.0
-        rows.append(row)
+        entries.append((len(right), 2 * i + 1, 1.0))
         right.append(0.0)
         owner.append(-1)
         base_weight.append(1.0 / _RATE_STD)
-    row = np.zeros(2 * count)
-    row[0] = 1.0
-    rows.append(row)
-    right.append(0.0)
-    owner.append(-1)
-    base_weight.append(1e6)
-    matrix, target, owners = np.array(rows), np.array(right), np.array(owner)
-    weight = np.array(base_weight)
-    solution = np.zeros(2 * count)
+    at, columns, values = zip(*entries, strict=True)
+    matrix = csr_array((values, (at, columns)), shape=(len(right), 2 * count))[:, 1:]  # the first offset is 0
+    target, owners, base = np.array(right), np.array(owner), np.array(base_weight)
+    solution, weight, error = np.zeros(2 * count), base, np.zeros(len(target))
     for _ in range(30):
-        solution = np.linalg.lstsq(matrix * weight[:, None], target * weight, rcond=None)[0]
-        error = np.abs(matrix @ solution - target)
-        weight = np.array(base_weight) / np.sqrt(np.where(owners >= 0, np.maximum(error / _LAG_STD, 0.1), 1.0))
+        weighted = matrix.multiply(weight[:, None] ** 2).T.tocsc()
+        # By a correction: rounding of the normal equations is corrected by the next one.
+        solution[1:] += splu(weighted @ matrix).solve(weighted @ (target - matrix @ solution[1:]))
+        error = np.abs(matrix @ solution[1:] - target)
+        weight = base / np.sqrt(np.where(owners >= 0, np.maximum(error / _LAG_STD, 0.1), 1.0))
     errors = np.array([error[owners == number].mean() for number in range(len(pairs))])
     return solution[::2], 1.0 + solution[1::2], errors

@@ -786,3 +786,38 @@ WIDE double homography_residual(integer n, const double *points_a, const double 
     }
     return median(n, distance) * spread_b;
 }
+
+/* protocols.validation.layouts.Layouts.match of one message. layout: words of a message, number of covariances, six
+   masks of each word, places of the covariances. */
+static int matches(const unsigned char *payload, integer size, const uint64_t *layout)
+{
+    const uint64_t *mask = layout + 2, words = layout[0];
+    uint64_t carry = 0, wrong = 0;
+    for (uint64_t k = 0; k < words; k++, mask += 6) {
+        uint64_t one = 0, left = (uint64_t)size - 8 * k;
+        memcpy(&one, payload + 8 * k, left < 8 ? left : 8);
+        uint64_t value = one & mask[2], sum = value + mask[3], total = sum + carry, unit = mask[5] >> 7;
+        carry = (sum < value) | (total < sum);
+        wrong |= ((one & mask[0]) ^ mask[1]) | ((total & mask[4]) ^ mask[5]);
+        wrong |= ((one & (mask[5] - unit)) + unit) & mask[5];
+    }
+    if (wrong) return 0;
+    for (uint64_t k = 0; k < layout[1]; k++) {
+        double one[3];
+        memcpy(one, payload + mask[k], sizeof one);
+        if (!(one[1] * one[1] <= one[0] * one[2])) return 0;
+    }
+    return 1;
+}
+
+/* Whether each of n messages, which follow each other, matches a layout. tables: of each size up to most, 0 or the
+   addresses of its layouts, and 0 at their end. */
+void match_layouts(integer n, const integer *sizes, const unsigned char *payload, integer most,
+                   const uint64_t *const *const *tables, unsigned char *found)
+{
+    for (integer i = 0; i < n; payload += sizes[i++]) {
+        const uint64_t *const *table = sizes[i] <= most ? tables[sizes[i]] : 0;
+        found[i] = 0;
+        for (; table && *table && !found[i]; table++) found[i] = (unsigned char)matches(payload, sizes[i], *table);
+    }
+}

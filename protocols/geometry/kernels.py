@@ -28,6 +28,7 @@ _SIGNATURES = {
     "smallest_eigenvalues": "npddndp",
     "neighbour_scores": "nppnpndp",
     "homography_residual": "nppnp",
+    "match_layouts": "nppnpp",
 }
 """Of each function: counts n, doubles d and pointers p."""
 
@@ -199,4 +200,12 @@ def homography_residual(a: Floats, b: Floats, iterations: int) -> float:
     count, scratch = len(a), np.empty(6 * len(a))
     a, b = _rows_last(a), _rows_last(b)
     found: float = _library.homography_residual(count, _at(a), _at(b), iterations, _at(scratch))
+    return found
+
+
+def match_layouts(payloads: Sequence[bytes], tables: Ints) -> bytearray:
+    """1 of each payload that matches a layout, as `protocols.validation.layouts.Layouts` has them, else 0."""
+    sizes, found = np.array([len(one) for one in payloads], dtype=np.int64), bytearray(len(payloads))
+    to = addressof(c_char.from_buffer(found))
+    _library.match_layouts(len(sizes), _at(sizes), b"".join(payloads), len(tables) - 1, _at(tables), to)
     return found

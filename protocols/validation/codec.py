@@ -7,7 +7,7 @@ that the caller counts. The limits are in ``protocols.validation.rules``.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -26,6 +26,7 @@ __all__ = [
     "Rejected",
     "RejectionReason",
     "admit",
+    "admit_all",
     "decode",
     "encode",
     "message_class",
@@ -151,3 +152,22 @@ def admit(key: str, payload: bytes) -> tuple[Address, Message]:
             _SENDERS.clear()
         _SENDERS[key, message.camera, message.boot_id] = address
     return address, message
+
+
+def admit_all(keys: Sequence[str], payloads: Sequence[bytes]) -> list[tuple[Address, Message] | Rejected]:
+    """``admit`` of several messages; what it raises is in its message's place."""
+    found: list[tuple[Address, Message] | Rejected] = []
+    parse = pb.Observation.FromString
+    for key, payload, matches in zip(keys, payloads, _LAYOUTS.match_all(payloads), strict=True):
+        try:
+            if matches:
+                observation = parse(payload)
+                found.append((_SENDERS[key, observation.camera, observation.boot_id], observation))
+                continue
+        except (DecodeError, KeyError):
+            pass
+        try:
+            found.append(admit(key, payload))
+        except Rejected as error:
+            found.append(error)
+    return found

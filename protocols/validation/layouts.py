@@ -17,16 +17,21 @@ refusals with their reasons come from ``rules`` alone.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from protocols.core.ranges import MAX_PIXEL
+from protocols.geometry import kernels
+from protocols.geometry.types import Ints
 
 _MAX_SIZE = 4096
 """Bytes of a message that is worth a layout: thirty people with all their fields."""
 _MAX_LAYOUTS, _MAX_OF_SIZE = 512, 4
 _FIRST_LAYOUTS, _HITS_PER_LAYOUT = 64, 8
 """A layout costs about three checks: where shapes do not come again, no more of them are made."""
+_LEAST_AT_ONCE = 8  # messages: of fewer the call of a kernel takes longer than they do one by one
 _VARIABLE, _LITERAL, _TEXT = 0, 1, 2  # kinds of a layout's parts
 _VARINTS = {0x08: 0, 0x20: 7, 0x28: 7, 0x30: 9, 0x38: 6}
 """Of an observation: most bytes of each varint, so that its bound holds (2⁵³, 2⁶², an hour); 0: as in the model."""
@@ -47,7 +52,8 @@ class _OddShapeError(Exception):
 
 
 class Layout(NamedTuple):
-    """See the module. text: 0x7F for each letter of a label; ones: 1 for each: a sum's bit 7 shows DEL."""
+    """See the module. text: 0x7F for each letter of a label; ones: 1 for each: a sum's bit 7 shows DEL.
+    packed: the same for ``kernels.match_layouts``."""
 
     structure: int
     skeleton: int
@@ -58,6 +64,7 @@ class Layout(NamedTuple):
     text: int
     ones: int
     covariances: Callable[[bytes], tuple[float, ...]] | None
+    packed: Ints
 
 
 class _Builder:
@@ -82,7 +89,11 @@ class _Builder:
             gaps = [b - a - 24 for a, b in zip([-24, *self.covariances], self.covariances, strict=False)]
             unpack = struct.Struct("<" + "".join(f"{gap}x3d" for gap in gaps)).unpack_from
         skeleton = int.from_bytes(self.payload, "little") & structure
-        return Layout(structure, skeleton, values, slack, high, ones << 7, text, ones, unpack)
+        parts, words = (structure, skeleton, values, slack, high, ones << 7), -(-len(self.payload) // 8)
+        bits = np.frombuffer(b"".join(part.to_bytes(8 * words, "little") for part in parts), dtype=np.int64)
+        by_word = bits.reshape(len(parts), words).T.ravel()
+        packed = np.array([words, len(self.covariances), *by_word, *self.covariances], dtype=np.int64)
+        return Layout(*parts, text, ones, unpack, packed)
 
     def _fields(self, at: int, end: int, field: Callable[[int, int], int]) -> None:
         """Process the fields of one message; each but the detections at most once."""
@@ -180,6 +191,18 @@ class Layouts:
     def __init__(self) -> None:
         self._of_size: dict[int, list[Layout]] = {}
         self._made = self._hits = self._kept = 0
+        self._packed: tuple[Ints, dict[int, tuple[Ints, list[Layout]]]] = np.zeros(_MAX_SIZE + 1, dtype=np.int64), {}
+        """Of each size the address of its layouts' addresses, and what is there; replaced, never changed."""
+
+    def match_all(self, payloads: Sequence[bytes]) -> Sequence[int]:
+        """Whether each of several certainly matches, and so need not be given to ``match``."""
+        if len(payloads) < _LEAST_AT_ONCE or not kernels.AVAILABLE:
+            return bytes(len(payloads))
+        tables, kept = self._packed  # both, as another thread may learn meanwhile
+        found = kernels.match_layouts(payloads, tables)
+        self._hits += sum(found)
+        del kept
+        return found
 
     def match(self, payload: bytes) -> bool:
         """Whether an observation, names aside, is surely valid; its payload must be parsable."""
@@ -187,7 +210,7 @@ class Layouts:
         if layouts is None:
             return False
         whole = int.from_bytes(payload, "little")
-        for structure, skeleton, values, slack, high, wanted, text, ones, covariances in layouts:
+        for structure, skeleton, values, slack, high, wanted, text, ones, covariances, _ in layouts:
             if whole & structure == skeleton:
                 if ((whole & values) + slack) & high != wanted or (text and ((whole & text) + ones) & wanted):
                     return False
@@ -208,10 +231,15 @@ class Layouts:
             return
         if self._kept >= _MAX_LAYOUTS:
             self._of_size, self._kept = {}, 0
+            self._packed = np.zeros_like(self._packed[0]), {}
         kept = self._of_size.get(len(payload), [])
         if len(kept) < _MAX_OF_SIZE:
             self._kept += 1
-        self._of_size[len(payload)] = [layout, *kept[: _MAX_OF_SIZE - 1]]
+        layouts = self._of_size[len(payload)] = [layout, *kept[: _MAX_OF_SIZE - 1]]
+        addresses = np.array([*(one.packed.ctypes.data for one in layouts), 0], dtype=np.int64)
+        tables = self._packed[0].copy()
+        tables[len(payload)] = addresses.ctypes.data
+        self._packed = tables, {**self._packed[1], len(payload): (addresses, layouts)}
 
 
 def _are_covariances(values: tuple[float, ...]) -> bool:

@@ -50,7 +50,7 @@ def adjust_to_control_points(
     for _ in range(_MAX_ITERATIONS):
         parts = eliminate(system)
         path = cho_solve_banded(parts.factor, system.gradient_path)
-        gradient = system.gradient_cameras - system.border.T @ path + now.gradient[columns]
+        gradient = system.gradient_cameras - system.border.transposed_times(path) + now.gradient[columns]
         rows, values = constraints(state)
         step, _ = constrained_step(
             parts.reduced + now.information[np.ix_(columns, columns)], -gradient, rows[:, columns], values

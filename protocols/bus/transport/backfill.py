@@ -25,7 +25,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -102,17 +102,23 @@ class Backfill(Generic[_Source]):
         self._bytes = 0
         self._lock = threading.Lock()
 
-    def take(self, source: _Source, number: int, key: str, payload: bytes) -> None:
-        """Process a message from the transport; duplicates by sequence number are discarded."""
-        who = key, source
+    def take(self, messages: Iterable[tuple[_Source, int | None, str, bytes]]) -> None:
+        """Process messages from the transport: source, number, key, payload; duplicates by number are discarded.
+
+        number: None where messages are not counted.
+        """
+        questions, push = [], self._push
         with self._lock:
-            expected = self._next.get(who)
-            if expected == number:  # nearly always the case
-                self._next[who] = (number + 1) % _SEQUENCE_MODULUS
-                self._push(source, key, payload)
-                return
-            question = self._out_of_sequence(who, expected, number, payload)
-        if question is not None:
+            for source, number, key, payload in messages:
+                who = key, source
+                expected = self._next.get(who)
+                if number is None or expected == number:  # nearly always the case
+                    if number is not None:
+                        self._next[who] = (number + 1) % _SEQUENCE_MODULUS
+                    push(source, key, payload)
+                elif (question := self._out_of_sequence(who, expected, number, payload)) is not None:
+                    questions.append(question)
+        for question in questions:
             self._ask(question)
 
     def answer(self, query: RecoveryQuery[_Source], number: int, key: str, payload: bytes) -> None:

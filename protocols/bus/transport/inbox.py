@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping
 from itertools import chain
 from typing import TypeAlias
@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 from protocols.bus.base import AgentEvent, Received, Refusal
 from protocols.core.names import name_of_segment
 from protocols.topics import Topic
-from protocols.validation.codec import MAX_PAYLOAD, Rejected, RejectionReason, admit, parse_key
+from protocols.validation.codec import MAX_PAYLOAD, Rejected, RejectionReason, admit_all, parse_key
 
 MAX_BYTES = 32 * 1024 * 1024
 """Upper bound of one inbox in bytes, so that a reader that has stopped does not exhaust the memory; half of it of
@@ -75,11 +75,11 @@ class Inbox:
         """The same of several, which are removed from ``arrived``: whoever calls it, they are queued in its order."""
         with self._ready:
             was_empty = self._length == 0
-            groups: dict[str, list[_Queued]] = {}
-            for _ in range(len(arrived)):
+            groups: defaultdict[str, list[_Queued]] = defaultdict(list)
+            first, self._order = self._order, self._order + len(arrived)
+            for order in range(first, self._order):
                 one = arrived.popleft()
-                self._order += 1
-                groups.setdefault(one[0], []).append((self._order, *one))
+                groups[one[0]].append((order, *one))
             for key, queued in groups.items():
                 self._queue(key, queued)
             while self._length > self._capacity or self._bytes > self._most:
@@ -169,12 +169,12 @@ class Inbox:
         # Sorting joins the queues, each of them in order, faster than a heap that is merged in Python.
         merged = sorted(chain.from_iterable(queues.values())) if len(queues) > 1 else [*chain(*queues.values())]
         new = tuple.__new__  # half of what Received's own takes
-        for _, key, payload, arrival_ns, source, numbered in merged:
-            try:
-                address, message = admit(key, payload)
-            except Rejected as error:
-                self.refuse(error, key, error.sequence)
+        admitted = admit_all([one[1] for one in merged], [one[2] for one in merged])
+        for (_, key, _, arrival_ns, source, numbered), found in zip(merged, admitted, strict=True):
+            if isinstance(found, Rejected):
+                self.refuse(found, key, found.sequence)
                 continue
+            address, message = found
             if not numbered:
                 self._count_gap(key, message)
             messages.append(new(Received, (address.topic, address.agent, message, arrival_ns, source)))

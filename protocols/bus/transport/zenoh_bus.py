@@ -39,6 +39,8 @@ _MAX_KEYS, _KEYS_PER_CALL = 8192, 8  # that are declared in all, and by one drai
 
 _Source: TypeAlias = tuple[str, int]
 """A publisher's identity in Zenoh: session id and entity id."""
+_PLAIN: _Source = ("", 0)
+"""A plain publisher, as zenoh-pico's: without recovery, and its gaps are those of its own numbers."""
 
 
 class ZenohPublisher:
@@ -173,36 +175,37 @@ class ZenohSubscription(InboxSubscription):
                 with suppress(zenoh.ZError):
                     while len(samples) < _AT_ONCE and (sample := channel.try_recv()) is not None:
                         samples.append(sample)
+                taken = []
                 for sample in samples:
                     try:
-                        self._take(sample)
+                        if (one := self._take(sample)) is not None:
+                            taken.append(one)
                     except Exception:  # noqa: BLE001 - of one message: the others are taken all the same
                         traceback.print_exc()
+                self._backfill.take(taken)
                 self.inbox.push_all(self._arrived)
             if len(samples) == _AT_ONCE:
                 time.sleep(_YIELD_S)
 
-    def _take(self, sample: zenoh.Sample) -> None:
+    def _take(self, sample: zenoh.Sample) -> tuple[_Source, int | None, str, bytes] | None:
+        """Publisher, its number if gaps are to be closed, key and payload; None of what is not wanted."""
         payload = sample.payload.to_bytes()
         if not payload and sample.kind != zenoh.SampleKind.PUT:  # a DELETE has no payload
-            return
+            return None
         source, key = sample.source_info, str(sample.key_expr)
         if key not in self._keys.met:
             if parse_key(key) is None:  # nothing is remembered of it
                 self.inbox.refuse(Rejected(RejectionReason.UNKNOWN_KEY, key[:200]), key)
-                return
+                return None
             self._keys.meet(key)
         if source is None:
-            # A plain publisher, as zenoh-pico's: without recovery, and its gaps are those of its own numbers.
-            self._arrived.append((key, payload, self._clock_ns(), "", False))
-            return
+            return _PLAIN, None, key, payload
         identity = source.source_id
         name = (str(identity.zid), identity.eid)
         if self._reliable:
-            self._backfill.take(name, source.source_sn, key, payload)
-        else:
-            self._count_gap((key, name), source.source_sn)
-            self._push(name, key, payload)
+            return name, source.source_sn, key, payload
+        self._count_gap((key, name), source.source_sn)
+        return name, None, key, payload
 
     def _count_gap(self, publisher: tuple[str, _Source], number: int) -> None:
         """Count the losses of a topic that is not recovered."""
@@ -215,7 +218,7 @@ class ZenohSubscription(InboxSubscription):
             self._newest[publisher] = number
 
     def _push(self, source: _Source, key: str, payload: bytes) -> None:
-        self._arrived.append((key, payload, self._clock_ns(), source[0], True))
+        self._arrived.append((key, payload, self._clock_ns(), source[0], source is not _PLAIN))
 
     def _ask(self, question: RecoveryQuery[_Source]) -> None:
         """Query one publisher's cache; its replies arrive on a Zenoh thread."""

@@ -29,7 +29,16 @@ from protocols.topics import (
     TRACK,
     Topic,
 )
-from protocols.validation.codec import MAX_PAYLOAD, Rejected, RejectionReason, admit, decode, encode, parse_key
+from protocols.validation.codec import (
+    MAX_PAYLOAD,
+    Rejected,
+    RejectionReason,
+    admit,
+    admit_all,
+    decode,
+    encode,
+    parse_key,
+)
 from tests.support.samples import SAMPLES, camera_info, observation, status
 
 
@@ -257,6 +266,31 @@ def test_who_was_admitted_once_is_known_by_key_name_and_run_together() -> None:
     for camera, boot in (("cam1", "boot-1"), ("cam0", "boot/1"), ("", "boot-1")):
         with pytest.raises(Rejected):
             admit(own, observation(camera, boot_id=boot).SerializeToString())
+
+
+def test_several_at_once_are_admitted_or_refused_like_each_of_them() -> None:
+    """A valid shape under another's key, with a wrong name, damaged, or too large among those that match a layout."""
+    own, other = (OBSERVATION.key_for("local", camera) for camera in ("cam0", "cam1"))
+    nan = observation("cam0")
+    nan.detections[0].u = math.nan
+    good = [(own, encode(observation("cam0", index))) for index in range(20)]
+    bad = [(key, good[3][1]) for key in (other, "x", CAMERA_INFO.key_for("local", "cam0"))]
+    bad += [(own, nan.SerializeToString()), (own, b""), (own, b"\xff" * (MAX_PAYLOAD + 1)), (own, good[3][1][:-3])]
+    bad += [(own, observation("cam0", boot_id="boot/1").SerializeToString())]
+    messages = [one for pair in zip(good, bad * 3, strict=False) for one in pair]
+    found = admit_all(*zip(*messages, strict=True))
+    for (key, payload), one in zip(messages, found, strict=True):
+        if isinstance(one, Rejected):
+            with pytest.raises(Rejected) as alone:
+                admit(key, payload)
+            assert (one.reason, one.detail, one.sequence) == (
+                alone.value.reason,
+                alone.value.detail,
+                alone.value.sequence,
+            )
+        else:
+            assert one == admit(key, payload)
+    assert [isinstance(one, Rejected) for one in found] == [False, True] * 20
 
 
 @pytest.mark.parametrize("name", ["agent_2", "CVLab1", "GoPro 2", "Kamera.Süd"])

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
 
 from hub.bundle import bordered_system
-from hub.bundle.adjustment import adjust, apply_step, gauge_tangent
-from hub.bundle.bordered_system import BAND, BorderedSystem, eliminate, solve
+from hub.bundle.adjustment import adjust, apply_step, gauge
+from hub.bundle.bordered_system import BAND, BorderedSystem, PathByCameras, eliminate, solve
 from hub.bundle.covariance import _inverse_blocks
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
@@ -133,7 +134,7 @@ def test_a_point_behind_the_camera_is_not_valid_and_not_nan() -> None:
     assert not line.valid.any()
     system, cost = build_system(problem, replace(state, cameras=cameras), prior, robust=True)
     assert np.isfinite(cost)
-    for part in (system.band, system.border, system.corner, system.gradient_path, system.gradient_cameras):
+    for part in (dense(system), system.gradient_path, system.gradient_cameras):
         assert np.isfinite(part).all()
 
 
@@ -165,7 +166,10 @@ def dense(system: BorderedSystem) -> Floats:
         rows = np.arange(size - distance)
         values = system.band[BAND - 1 - distance, distance:]
         full[rows, rows + distance] = full[rows + distance, rows] = values
-    return np.block([[full, system.border], [system.border.T, system.corner]])
+    border = np.zeros((size, len(system.corner)))
+    for part, columns, block in system.border.parts:
+        border[part, columns] = block
+    return np.block([[full, border], [border.T, system.corner]])
 
 
 def test_the_banded_normal_matrix_equals_the_dense_one() -> None:
@@ -245,9 +249,8 @@ def test_lens_priors_that_are_all_none_change_nothing() -> None:
 def test_the_bordered_solution_equals_the_dense_one(damping: float) -> None:
     problem, state, prior = simulated_problem(6, perturbation=1e-3)
     system, _ = build_system(problem, state, prior, robust=True)
-    tangent = gauge_tangent(problem, state)
-    assert tangent is not None
-    path, cameras = solve(system, damping, tangent)
+    tangent = null_space(gauge(problem, state))
+    path, cameras = solve(system, damping, gauge(problem, state))
     full, size = dense(system), system.band.shape[1]
     full += damping * np.diag(np.diag(full))
     lift = np.block([[np.eye(size), np.zeros((size, tangent.shape[1]))], [np.zeros((len(tangent), size)), tangent]])
@@ -260,9 +263,9 @@ def test_the_bordered_solution_equals_the_dense_one(damping: float) -> None:
 def test_without_free_cameras_only_the_path_moves() -> None:
     problem, state, prior = simulated_problem(6, perturbation=1e-3)
     fixed = replace(problem, free_parameters=FreeParameters(pose=False, clock=False, lens=False))
-    assert gauge_tangent(fixed, state) is None
+    assert gauge(fixed, state).shape == (0, 0)
     system, before = build_system(fixed, state, prior, robust=False)
-    path, cameras = solve(system, 0.0, None)
+    path, cameras = solve(system, 0.0, np.zeros((0, 0)))
     assert len(cameras) == 0
     assert build_system(fixed, apply_step(fixed, state, path, cameras), prior, robust=False)[1] < before
 
@@ -285,9 +288,9 @@ def test_inverse_blocks_equal_those_of_the_dense_inverse() -> None:
 def test_a_path_past_a_cameras_centre_leaves_the_stds_and_steps_of_others_as_they_are() -> None:
     problem, state, prior = simulated_problem(7)
     system, _ = build_system(problem, state, prior, robust=False)
-    before, step = _inverse_blocks(system.band), solve(system, 0.0, gauge_tangent(problem, state))[0]
+    before, step = _inverse_blocks(system.band), solve(system, 0.0, gauge(problem, state))[0]
     system.band[-1, -1] = 1e25 * system.band[-1].max()
-    after, held = _inverse_blocks(system.band), solve(system, 0.0, gauge_tangent(problem, state))[0]
+    after, held = _inverse_blocks(system.band), solve(system, 0.0, gauge(problem, state))[0]
     np.testing.assert_allclose(after[0, :BAND, :BAND], before[0, :BAND, :BAND], rtol=0.1)
     assert np.linalg.norm(held[:BAND]) > 0.1 * np.linalg.norm(step[:BAND])
 
@@ -314,10 +317,9 @@ def test_border_blocks_take_rows_in_any_order() -> None:
     np.testing.assert_allclose(out, expected.reshape(-1, 5), atol=1e-12)
 
 
-def test_steps_in_the_gauge_tangent_keep_the_gauge() -> None:
+def test_steps_perpendicular_to_the_gauge_keep_it() -> None:
     problem, state, _ = simulated_problem(9)
-    tangent = gauge_tangent(problem, state)
-    assert tangent is not None
+    tangent = null_space(gauge(problem, state))
     np.testing.assert_allclose(tangent.T @ tangent, np.eye(tangent.shape[1]), atol=1e-12)
     assert tangent.shape == (len(problem.free_columns()), len(problem.free_columns()) - 7)
     rng = np.random.default_rng(0)
@@ -392,3 +394,49 @@ def test_a_row_that_a_clock_moves_past_the_end_of_the_path_still_has_a_gradient(
     assert np.isfinite(line.residual).all()
     far = linearise(rows, replace(early, offset=early.offset - path.basis.spacing), path)
     assert not far.valid.all()
+
+
+def street_system(cameras: int, width: int = 8, size: int = 6) -> BorderedSystem:
+    """Of labels that three neighbouring cameras observe each, the cameras in no order."""
+    rng = np.random.default_rng(cameras)
+    order, step = rng.permutation(cameras), 3 * size
+    paths = step * (cameras - 2)
+    whole, parts = np.zeros((paths + width * cameras,) * 2), []
+    for label in range(cameras - 2):
+        columns = np.concatenate([width * camera + np.arange(width) for camera in order[label : label + 3]])
+        for camera in range(3):
+            for first in np.repeat(np.arange(size - 3), 8):
+                row = np.zeros((2, len(whole)))
+                row[:, step * label + 3 * first + np.arange(12)] = rng.normal(size=(2, 12))
+                row[:, paths + columns[width * camera : width * (camera + 1)]] = rng.normal(size=(2, width))
+                whole += row.T @ row
+        part = slice(step * label, step * (label + 1))
+        parts.append((part, columns, whole[part, paths + columns]))
+    band = np.zeros((BAND, paths))
+    for distance in range(BAND):
+        band[BAND - 1 - distance, distance:] = np.diagonal(whole[:paths, :paths], distance)
+    border, gradient = PathByCameras(tuple(parts), width * cameras), rng.normal(size=len(whole))
+    return BorderedSystem(band, border, whole[paths:, paths:], gradient[:paths], gradient[paths:])
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_the_step_of_cameras_that_overlap_few_others_equals_the_dense_one(
+    held: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = street_system(24)
+    fixed = np.zeros((7 if held else 0, len(system.corner)))
+    if held:
+        fixed[np.arange(6), 40 + np.arange(6)] = 1.0
+        fixed[6, 83:86] = [0.6, 0.0, -0.8]
+    banded = solve(system, 1e-3, fixed)
+    monkeypatch.setattr(bordered_system, "_solve_banded_cameras", None)  # it is what was called
+    with pytest.raises(TypeError):
+        solve(system, 1e-3, fixed)
+    monkeypatch.setattr(bordered_system, "_narrowest_order", lambda groups, size: (np.arange(size), size))
+    for ours, expected in zip(banded, solve(system, 1e-3, fixed), strict=True):
+        np.testing.assert_allclose(ours, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
+    assert np.abs(fixed @ banded[1]).max(initial=0.0) < 1e-12 * np.abs(banded[1]).max()
+    monkeypatch.undo()
+    system.corner[30, 30] = -1e9
+    with pytest.raises(np.linalg.LinAlgError):
+        solve(system, 1e-3, fixed)

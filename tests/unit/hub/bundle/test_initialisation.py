@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -33,3 +34,24 @@ def test_a_fraction_of_many_rows_is_used_with_enough_per_knot(monkeypatch: pytes
             assert np.isin(after.time, before.time).all()
             np.testing.assert_array_equal(after.pixels[:, 0], after.time)
             np.testing.assert_allclose(after.stamps, after.time + 7.0)
+
+
+def test_a_path_is_triangulated_again_only_where_one_of_its_cameras_has_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+
+    def triangulated(names: list[str], states: object, cameras: object, label: str) -> tuple[str, ...]:
+        made.append(label)
+        return (label, *names)
+
+    monkeypatch.setattr(initialisation, "triangulate_label", triangulated)
+    _, state, _ = simulated_problem(3)
+    one, other, third = state.cameras
+    seen = {"a": ("x",), "b": ("x", "y"), "c": ("y",)}
+    cameras = {name: SimpleNamespace(tracks=dict.fromkeys(labels)) for name, labels in seen.items()}
+    kept = initialisation._Triangulated(cameras, ["x", "y"])  # type: ignore[arg-type]
+    placed = {"a": one, "b": other}
+    assert [kept.path(label, placed) for label in "xy"] == [("x", "a", "b"), ("y", "b")]
+    assert [kept.path(label, placed | {"c": third}) for label in "xy"] == [("x", "a", "b"), ("y", "b", "c")]
+    assert made == ["x", "y", "y"]
+    assert kept.path("x", {"a": replace(one, offset=one.offset + 1.0), "b": other}) == ("x", "a", "b")
+    assert made == ["x", "y", "y", "x"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,10 @@ from hub.two_view.relative_pose import homography_residual
 from protocols.geometry import kernels
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
+from protocols.validation.layouts import Layouts
 from tests.bench.pair_trials import FOCAL, MATRIX, Regime, make_trial
+from tests.unit.protocols.test_layouts import NASTY_NUMBERS as NASTY
+from tests.unit.protocols.test_layouts import whole
 
 _SOURCE = Path(kernels.__file__).with_name("kernels.c")
 Both = Callable[[Callable[[], Floats]], tuple[Floats, Floats]]
@@ -159,3 +163,20 @@ def test_only_contiguous_arrays_are_handed_over() -> None:
     assert kernels._at(np.zeros((3, 4)))
     with pytest.raises(AssertionError, match="beside"):
         kernels._at(np.zeros((3, 4)).T)
+
+
+def test_observations_match_the_same_layouts(both: Both) -> None:
+    """Of several shapes, whole and damaged in each place, with too large a message and an empty one between them."""
+    layouts = Layouts()
+    for points in range(4):
+        layouts.learn(whole(0, points).SerializeToString())
+    rng = np.random.default_rng(5)
+    payloads = [whole(seed, seed % 6).SerializeToString() for seed in range(60)] + [b"", bytes(5000)]
+    for at in range(len(payloads[3])):
+        damaged = bytearray(payloads[3])
+        damaged[at : at + 8] = struct.pack("<d", rng.choice(NASTY)) if at % 2 else rng.bytes(1)
+        payloads.append(bytes(damaged))
+    compiled, alone = both(lambda: np.array([*layouts.match_all(payloads)]))
+    np.testing.assert_array_equal(compiled, [layouts.match(payload) for payload in payloads])
+    assert 40 <= compiled.sum() < len(payloads)
+    assert not alone.any(), "without kernels they are matched one by one"

@@ -27,8 +27,7 @@ class Stage:
         self.lost += count
 
     def take(self, source: str, *numbers: int) -> None:
-        for number in numbers:
-            self.backfill.take(source, number, f"key-{source}", f"{source}{number}".encode())
+        self.backfill.take((source, number, f"key-{source}", f"{source}{number}".encode()) for number in numbers)
 
     def answer(self, *numbers: int, served: bool = True) -> None:
         """The answers to the last question, and their end."""
@@ -157,7 +156,7 @@ def test_another_s_identity_on_one_s_own_key_silences_nobody() -> None:
     """One put with another camera's source id silenced that camera, with certificates too."""
     stage = Stage()
     stage.take("a", 0, 1, 2)
-    stage.backfill.take("a", 2**31, "key-forger", b"forged")
+    stage.backfill.take([("a", 2**31, "key-forger", b"forged")])
     stage.take("a", 3, 4)
     stage.after(GAP_TIMEOUT_S + 1.0)
     stage.take("a", 5)
@@ -197,7 +196,7 @@ def test_invented_publishers_of_one_key_are_forgotten_first() -> None:
     stage = Stage()
     stage.take("a", 0, 1)
     for number in range(1000):
-        stage.backfill.take(f"x{number}", 0, "key-forger", b"forged")
+        stage.backfill.take([(f"x{number}", 0, "key-forger", b"forged")])
     assert len(stage.backfill._next) < 20
     stage.take("a", 2)
     assert stage.out[-1] == "a2"
