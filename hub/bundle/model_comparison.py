@@ -21,7 +21,7 @@ from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block
 from hub.bundle.correlated_noise import MIN_INFLATION, lens_tolerance
 from hub.bundle.covariance import constrained_step
 from hub.bundle.gauss_markov import estimate_correlated_noise
-from hub.bundle.noise_scale import correlation_inflation, modelled_inflation
+from hub.bundle.noise_scale import correlation_inflation, modelled_inflation, score_inflation
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
     CAMERA_PARAMETERS,
@@ -242,6 +242,9 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
         return None
     problem, state = weighted_by_jitter(_with_rows_of_a_step(problem, state), state)
     inflation = correlation_inflation(problem, state)
+    scores = (score_inflation(problem, state, camera) for camera in range(len(state.cameras)))
+    if inflation.max() < MIN_INFLATION and max(scores) < MIN_INFLATION:
+        return None  # no errors last, as a step's would
     # A camera that steps has the most correlated residuals of all, for that reason: here it must not count for less.
     linear, trials = _Linearised.of(problem, state, state.sigma * np.sqrt(np.median(inflation))), []
     needed = _needed_for_a_step(problem)

@@ -14,7 +14,7 @@ import numpy as np
 
 from hub.bundle.bordered_system import BAND
 from hub.bundle.covariance import Covariance, covariance
-from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, Problem, TrackObservations
+from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, AdjustmentState, Problem, TrackObservations
 from hub.bundle.residuals import linearise, predict
 from hub.bundle.smoothness_prior import SmoothnessPrior
 from hub.trajectory.discrete import PointBasis
@@ -117,6 +117,21 @@ def _inflation_of(problem: Problem, state: AdjustmentState, camera: int) -> floa
         residual = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
         good = np.isfinite(residual).all(axis=1)
         parts.append((rows.stamps[rows.use][good], residual[good]))
+    frames = _within_frame_inflation(parts)
+    return frames * _serial_inflation(parts, frames)
+
+
+def score_inflation(problem: Problem, state: AdjustmentState, camera: int) -> float:
+    """Rows per effective row for what tells a clock: residuals times their velocities.
+
+    Where the motion turns from frame to frame, the residuals of a lasting time error do too, while these do not.
+    """
+    parts: list[tuple[Floats, Floats]] = []
+    for rows in problem.rows:
+        if rows.camera == camera and np.count_nonzero(rows.use) >= 8:
+            line = linearise(rows, state.cameras[camera], state.trajectories[rows.label], OFFSET + 1)
+            score = (line.residual * line.camera_jacobian[:, :, OFFSET]).sum(axis=1)
+            parts.append((rows.stamps[rows.use][line.valid], np.column_stack([score, score])[line.valid]))
     frames = _within_frame_inflation(parts)
     return frames * _serial_inflation(parts, frames)
 
