@@ -122,7 +122,7 @@ def _inflation_of(problem: Problem, state: AdjustmentState, camera: int) -> floa
 
 
 def score_inflation(problem: Problem, state: AdjustmentState, camera: int) -> float:
-    """Rows per effective row for what tells a clock: residuals times their velocities.
+    """Rows per effective row in the score of a clock's offset: residuals times velocities.
 
     Where the motion turns from frame to frame, the residuals of a lasting time error do too, while these do not.
     """

@@ -100,7 +100,8 @@ def weighted_by_jitter(problem: Problem, state: AdjustmentState) -> tuple[Proble
         jitter = _jitter_std(frames, float(sigma[camera])) if state.jitter is None else float(state.jitter[camera])
         if not jitter:
             continue
-        across = _transverse(frames.residual, frames.velocity) / np.linalg.norm(frames.velocity, axis=1)
+        speed = np.maximum(np.linalg.norm(frames.velocity, axis=1), 1e-9)
+        across = _transverse(frames.residual, frames.velocity) / speed
         noise = sigma[camera] = max(_MAD_TO_SIGMA * float(np.median(np.abs(across))), _MIN_SIGMA_PX)
         mine = [index for index, part in enumerate(rows) if part.camera == camera]
         square = [np.nan_to_num(np.square(_velocity(rows[index], state)[1]).sum(axis=1)) for index in mine]

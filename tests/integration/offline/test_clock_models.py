@@ -1,4 +1,4 @@
-"""A step, a readout and jitter of a camera's clock are told apart, whatever the motion and the frame rate."""
+"""A step, a readout and jitter of a camera's clock are distinguished, whatever the motion and the frame rate."""
 
 from __future__ import annotations
 
