@@ -4,9 +4,7 @@
     [ Bᵀ C ] [ cameras        ] = [ h ]
 
 A is banded because the spline at one time depends on four control points; eliminating it costs time linear in the
-length of the recording (Schur complement C - Bᵀ A⁻¹ B). A label's path meets only the cameras that observe it. Where
-each camera shares labels with few others, the Schur complement is banded too, in the order of Cuthill and McKee
-("Reducing the bandwidth of sparse symmetric matrices", 1969).
+length of the recording (Schur complement C - Bᵀ A⁻¹ B). A label's path meets only the cameras that observe it.
 """
 
 from __future__ import annotations
@@ -15,10 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse import csc_array
 
-from hub.bundle.problem import CAMERA_PARAMETERS
+from hub.bundle.block_matrix import BlockSum
 from hub.trajectory.banded import cho_solve_banded, cholesky_banded, solve_upper_transposed
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT, SplineBasis
@@ -71,7 +68,7 @@ class BorderedSystem:
 
     band: Floats
     border: PathByCameras
-    corner: Floats
+    corner: BlockSum
     gradient_path: Floats
     gradient_cameras: Floats
 
@@ -198,17 +195,19 @@ class Elimination:
 
     factor: Floats
     a_inv_b: PathByCameras
-    reduced: Floats
+    reduced: BlockSum
 
 
 def eliminate(system: BorderedSystem, damping: float = 0.0) -> Elimination:
     """Factor A (damped on its diagonal) and form the Schur complement. Raises LinAlgError if not positive definite."""
     factor = _damped_cholesky(system.band, damping)
-    parts, reduced = [], system.corner.copy()
+    parts, grams = [], []
     for rows, columns, block in system.border.parts:
         parts.append((rows, columns, cho_solve_banded(factor[:, rows], block)))
-        reduced[np.ix_(columns, columns)] -= block.T @ parts[-1][2]
-    return Elimination(factor, replace(system.border, parts=tuple(parts)), np.asarray(0.5 * (reduced + reduced.T)))
+        gram = block.T @ parts[-1][2]
+        grams.append((columns, -0.5 * (gram + gram.T)))
+    schur = BlockSum(np.zeros(system.corner.size), tuple(grams))
+    return Elimination(factor, replace(system.border, parts=tuple(parts)), system.corner + schur)
 
 
 def solve(system: BorderedSystem, damping: float, fixed: Floats) -> tuple[Floats, Floats]:
@@ -217,7 +216,7 @@ def solve(system: BorderedSystem, damping: float, fixed: Floats) -> tuple[Floats
     fixed: (q, p) orthonormal directions in which the cameras do not move (the gauge).
     """
     factor = _damped_cholesky(system.band, damping)
-    rhs, grams = -system.gradient_cameras, []
+    diagonal, rhs, parts = system.corner.diagonal(), -system.gradient_cameras, []
     for rows, columns, block in system.border.parts:
         # Half of the work of `eliminate` is enough: with A = Uᵀ U and H = U⁻ᵀ [B g], Hᵀ H holds Bᵀ A⁻¹ B and Bᵀ A⁻¹ g.
         half_solved = np.empty((len(block), len(columns) + 1), order="F")
@@ -225,70 +224,18 @@ def solve(system: BorderedSystem, damping: float, fixed: Floats) -> tuple[Floats
         half_solved = solve_upper_transposed(factor[:, rows], half_solved)
         gram = half_solved.T @ half_solved
         rhs[columns] += gram[:-1, -1]
-        grams.append((columns, gram[:-1, :-1]))
+        parts.append((columns, -gram[:-1, :-1]))
     # Where ``fixed`` x = 0, adding its squares to the matrix changes nothing, and the matrix is then definite.
-    squares = (fixed, fixed**2 @ np.diag(system.corner))
-    diagonal = np.asarray(damping * np.diag(system.corner) + _CAMERA_REGULARISATION)
-    right = np.column_stack([rhs, fixed.T])
-    order, bandwidth = _narrowest_order([columns for columns, _ in grams], len(rhs))
-    if 2 * bandwidth < len(rhs):
-        solved = _solve_banded_cameras(system.corner, diagonal, grams, squares, right, order, bandwidth)
-    else:
-        matrix: Floats = system.corner + np.diag(diagonal) + fixed.T @ (squares[1][:, None] * fixed)
-        for columns, gram in grams:
-            matrix[np.ix_(columns, columns)] -= gram
-        solved = np.asarray(np.linalg.solve(matrix, right))
+    for row in fixed:
+        touched = np.flatnonzero(row)
+        parts.append((touched, float(row**2 @ diagonal) * np.outer(row[touched], row[touched])))
+    matrix = system.corner + BlockSum(damping * diagonal + _CAMERA_REGULARISATION, tuple(parts))
+    right, factored = np.column_stack([rhs, fixed.T]), matrix.factored()
+    solved = np.linalg.solve(matrix.dense(), right) if factored is None else factored.solve(right)
     moved = solved[:, 1:]
-    cameras = solved[:, 0] - moved @ np.linalg.solve(fixed @ moved, fixed @ solved[:, 0])
+    cameras = np.asarray(solved[:, 0] - moved @ np.linalg.solve(fixed @ moved, fixed @ solved[:, 0]))
     path = cho_solve_banded(factor, system.gradient_path + system.border @ cameras)
-    return -path, np.asarray(cameras)
-
-
-def _narrowest_order(groups: list[Ints], size: int) -> tuple[Ints, int]:
-    """Order (p,) of parameters in which those of one group are close together, and how far apart they are at most."""
-    if 2 * max(map(len, groups), default=0) >= size:
-        return np.arange(size), size
-    starts = np.cumsum([0, *map(len, groups)])
-    members = csr_array((np.ones(starts[-1]), np.concatenate(groups), starts), shape=(len(groups), size))
-    order = reverse_cuthill_mckee(csr_array(members.T @ members), symmetric_mode=True).astype(np.int64)
-    place = np.argsort(order)
-    return order, max(int(np.ptp(place[columns])) for columns in groups if len(columns))
-
-
-def _solve_banded_cameras(
-    corner: Floats,
-    diagonal: Floats,
-    grams: list[tuple[Ints, Floats]],
-    squares: tuple[Floats, Floats],
-    right: Floats,
-    order: Ints,
-    bandwidth: int,
-) -> Floats:
-    """Solution (p, k) where the Schur complement of ``grams`` is a band in this order. Raises LinAlgError.
-
-    diagonal: (p,) to be added. squares: rows (q, p) of few parameters whose squares are added, and their weights.
-    """
-    place = np.argsort(order)
-    band = np.zeros((len(order), bandwidth + 1))  # by column, what is above the diagonal first
-
-    def add(columns: Ints, block: Floats) -> None:
-        inner = np.argsort(place[columns])
-        first, second = np.triu_indices(len(columns))
-        at = place[columns[inner]]
-        band[at[second], bandwidth - at[second] + at[first]] += block[np.ix_(inner, inner)][first, second]
-
-    for distance in range(CAMERA_PARAMETERS):
-        one, other = place[: len(place) - distance], place[distance:]
-        values, apart = np.diagonal(corner, distance), np.abs(one - other)
-        within = apart <= bandwidth  # else of two cameras, and 0
-        band[np.maximum(one, other)[within], bandwidth - apart[within]] += values[within]
-    band[:, -1] += diagonal[order]
-    for columns, gram in grams:
-        add(columns, -gram)
-    for row, weight in zip(*squares, strict=True):
-        columns = np.flatnonzero(row)
-        add(columns, weight * np.outer(row[columns], row[columns]))
-    return cho_solve_banded(cholesky_banded(band.T), right[order])[place]
+    return -path, cameras
 
 
 def _damped_cholesky(band: Floats, damping: float) -> Floats:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from hub.bundle.adjustment import estimate_noise
-from hub.bundle.covariance import relative_rotation_stds
+from hub.bundle.covariance import CameraCovariance, relative_rotation_stds
 from hub.bundle.gauss_markov import estimate_correlated_noise
 from hub.bundle.gls import GlsSolution, is_tractable, solve_gls
 from hub.bundle.noise_scale import correlation_inflation
@@ -113,7 +113,8 @@ def _with_nominal_lenses(problem: Problem, state: AdjustmentState) -> Adjustment
 
 def _largest_rotation_std(problem: Problem, best: GlsSolution) -> float:
     """Largest over the cameras of the smallest relative rotation std [rad] to any other camera."""
-    stds = relative_rotation_stds(best.covariance_of(problem), best.state)
+    covariance = CameraCovariance(problem.free_columns(), len(best.state.cameras), best.free)
+    stds = relative_rotation_stds(covariance, best.state)
     np.fill_diagonal(stds, np.inf)
     return float(stds.min(axis=1).max())
 
@@ -135,6 +136,6 @@ def prefers_nominal_lenses(problem: Problem, best: GlsSolution) -> bool:
         return False  # no lens was given
     lens_rows = np.array([i for i, column in enumerate(columns) if int(column) in terms], dtype=np.int64)
     offset, std = np.array([terms[int(columns[i])] for i in lens_rows]).T
-    posterior = best.free[np.ix_(lens_rows, lens_rows)]
+    posterior = best.free.submatrix(lens_rows)
     quadratic = float(offset @ np.linalg.solve(posterior, offset))
     return bool(quadratic + np.linalg.slogdet(posterior)[1] < 2.0 * np.log(std).sum())

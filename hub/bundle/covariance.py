@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.sparse import block_diag, csr_array, eye_array
 from scipy.special import erf
 
+from hub.bundle.block_matrix import BlockSum, BlockTridiagonal, DenseCovariance, ParameterCovariance, SparseCovariance
 from hub.bundle.bordered_system import BAND, PathByCameras, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState, Problem
@@ -16,24 +18,62 @@ from hub.bundle.smoothness_prior import SmoothnessPrior
 from hub.trajectory.splines import SUPPORT, weighted_sums
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Ints
 
 _Z_95 = 1.96  # 97.5 % quantile of the standard normal distribution
 _COVERAGE_95 = float(erf(_Z_95 / np.sqrt(2.0)))
 _HALVINGS = 24  # of the interval: to 1e-7 of its width
+_IS_HELD = 1e-9  # of a parameter's square that no direction holds, from which it moves
+_HOLDING_SHARE = 1e-5
+"""Of a parameter's information beside known others: about what is left with all others unknown, so that holding it
+neither hides the rest in rounding nor leaves the matrix singular."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Covariance:
-    """Joint covariance of all camera parameters, and the blocks needed for that of the path.
+@dataclass(frozen=True, eq=False)
+class CameraCovariance:
+    """Joint covariance of all camera parameters.
 
-    cameras: (18 n, 18 n), zero where a parameter is fixed. a_inv_b: (3 m, p) A⁻¹ B over the free columns.
-    free: (p, p) covariance of the free columns. blocks: (k, 24, 24) blocks of A⁻¹ about the diagonal.
+    columns: (p,) the free ones of 18 n parameters of n cameras; fixed ones have none. free: (p, p) of these.
     """
 
-    cameras: Floats
+    columns: Ints
+    cameras: int
+    free: ParameterCovariance
+
+    def of(self, parameters: Ints) -> Floats:
+        """(k, k) covariance of parameters (k,) of all cameras' 18 n."""
+        place = np.minimum(np.searchsorted(self.columns, parameters), len(self.columns) - 1)
+        is_free = self.columns[place] == parameters
+        out = np.zeros((len(parameters), len(parameters)))
+        out[np.ix_(is_free, is_free)] = self.free.submatrix(place[is_free])
+        return out
+
+    def of_each_camera(self, *parameters: int) -> Floats:
+        """(n k, n k) covariance of k parameters of every camera."""
+        return self.of((np.arange(self.cameras)[:, None] * CAMERA_PARAMETERS + np.array(parameters)).ravel())
+
+    @cached_property
+    def variances(self) -> Floats:
+        """(n, 18) of all parameters."""
+        return self.spread(self.free.diagonal()).reshape(-1, CAMERA_PARAMETERS)
+
+    @cached_property
+    def clocks(self) -> Floats:
+        """(2 n, 2 n) of offset and rate of every camera."""
+        return self.of_each_camera(OFFSET, RATE)
+
+    def spread(self, values: Floats) -> Floats:
+        """(18 n, …) values (p, …) of the free parameters among all, 0 of fixed ones."""
+        out = np.zeros((self.cameras * CAMERA_PARAMETERS, *values.shape[1:]))
+        out[self.columns] = values
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance(CameraCovariance):
+    """With the path's. a_inv_b: (3 m, p) A⁻¹ B. blocks: (k, 24, 24) blocks of A⁻¹ about the diagonal."""
+
     a_inv_b: PathByCameras
-    free: Floats
     blocks: Floats
 
 
@@ -41,7 +81,7 @@ def covariance(
     problem: Problem,
     state: AdjustmentState,
     prior: SmoothnessPrior,
-    control_information: Floats | None = None,
+    control_information: BlockSum | None = None,
     datum_points: list[tuple[int, Floats]] | None = None,
     exact: Floats | None = None,
 ) -> Covariance:
@@ -58,42 +98,65 @@ def covariance(
     information = parts.reduced
     constraints = np.zeros((0, len(columns)))
     if problem.free_parameters.pose:
-        prior_information = (
-            np.zeros((len(state.cameras) * CAMERA_PARAMETERS,) * 2)
-            if control_information is None
-            else control_information
-        )
-        information = information + prior_information[np.ix_(columns, columns)]
+        given = control_information or BlockSum(np.zeros(len(state.cameras) * CAMERA_PARAMETERS))
+        information = information + given.restricted(columns)
         if datum_points:
             constraints = inner_constraints(parts.a_inv_b, state, datum_points)
         else:
-            constraints = gauge_constraints([camera.pose for camera in state.cameras], prior_information)[:, columns]
+            constraints = gauge_constraints([camera.pose for camera in state.cameras], given)[:, columns]
         if exact is not None:
             constraints = np.concatenate([constraints, exact[:, columns]])
     _, free = constrained_step(information, np.zeros(len(columns)), constraints, np.zeros(len(constraints)))
-    width = len(state.cameras) * CAMERA_PARAMETERS
-    full = np.zeros((width, width))
-    full[np.ix_(columns, columns)] = free
-    return Covariance(full, parts.a_inv_b, free, _inverse_blocks(system.band))
+    return Covariance(columns, len(state.cameras), free, parts.a_inv_b, _inverse_blocks(system.band))
 
 
-def constrained_step(normal: Floats, right: Floats, rows: Floats, values: Floats) -> tuple[Floats, Floats]:
+def constrained_step(
+    normal: BlockSum, right: Floats, rows: Floats, values: Floats
+) -> tuple[Floats, ParameterCovariance]:
     """The step (p,) that solves ``normal @ step = right`` subject to ``rows @ step = -values``, and its covariance.
 
     Rows may repeat each other; ones that contradict each other are met in the least-squares sense.
     """
-    if not len(rows):
-        covariance: Floats = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-        return covariance @ right, covariance
-    length, touched = np.linalg.norm(rows, axis=1), rows.any(axis=0)
-    left, size, short = np.linalg.svd(rows[:, touched] / length[:, None], full_matrices=False)
-    rank = int(np.count_nonzero(size > 1e-9 * size[0]))
-    vt = np.zeros((rank, rows.shape[1]))
-    vt[:, touched] = short[:rank]
-    fixed = -vt.T @ ((left[:, :rank].T @ (values / length)) / size[:rank])
-    tangent = _complement(vt)
-    covariance = np.asarray(tangent @ np.linalg.inv(tangent.T @ normal @ tangent) @ tangent.T, dtype=np.float64)
-    return fixed + covariance @ (right - normal @ fixed), covariance
+    fixed, directions = np.zeros(len(right)), np.zeros((0, len(right)))
+    if len(rows):
+        length, touched = np.linalg.norm(rows, axis=1), rows.any(axis=0)
+        left, size, short = np.linalg.svd(rows[:, touched] / length[:, None], full_matrices=False)
+        rank = int(np.count_nonzero(size > 1e-9 * size[0]))
+        directions = np.zeros((rank, len(right)))
+        directions[:, touched] = short[:rank]
+        fixed = -directions.T @ ((left[:, :rank].T @ (values / length)) / size[:rank])
+        right = right - normal @ fixed
+    covariance = _constrained_inverse(normal, directions)
+    return fixed + covariance @ right, covariance
+
+
+def _constrained_inverse(normal: BlockSum, directions: Floats) -> ParameterCovariance:
+    """Covariance (p, p) of parameters that do not move in orthonormal ``directions`` (q, p).
+
+    Alone the normal matrix need not be definite. So a few parameters that the directions touch are held in addition,
+    weakly, and let go again (Woodbury's identity).
+    """
+    weight = np.where(directions.any(axis=0), _HOLDING_SHARE * normal.diagonal(), 0.0)
+    held = np.flatnonzero(weight)
+    last = max(len(held) - CAMERA_PARAMETERS, 0)
+    held = np.unique([held[first : first + CAMERA_PARAMETERS] for first in (0, last // 2, last)])
+    weight[np.setdiff1d(np.arange(normal.size), held)] = 0.0
+    factored = (normal + BlockSum(weight)).factored()
+    if factored is None:
+        if not len(directions):
+            return DenseCovariance(np.asarray(np.linalg.inv(normal.dense()), dtype=np.float64))
+        tangent = _complement(directions)
+        inside = np.linalg.inv(tangent.T @ normal.dense() @ tangent)
+        return DenseCovariance(np.asarray(tangent @ inside @ tangent.T, dtype=np.float64))
+    across = factored.solve(directions.T)
+    fixing = -np.linalg.inv(directions @ across)
+    units = np.zeros((normal.size, len(held)))
+    units[held, np.arange(len(held))] = 1.0
+    along = factored.solve(units) + across @ (fixing @ across[held].T)
+    release = np.linalg.inv(np.diag(1.0 / weight[held]) - along[held])
+    low, middle = np.column_stack([across, along]), block_diag([fixing, release]).toarray()
+    moves = np.where(np.square(directions).sum(axis=0) < 1.0 - _IS_HELD, 1.0, 0.0)
+    return SparseCovariance(factored, low, middle, moves)
 
 
 def _complement(fixed: Floats) -> csr_array[Any]:
@@ -104,14 +167,11 @@ def _complement(fixed: Floats) -> csr_array[Any]:
     return csr_array(block_diag([eye_array(int((~touched).sum())), mixed]))[np.argsort(places)]
 
 
-def relative_rotation_stds(cameras: Floats, state: AdjustmentState) -> Floats:
-    """(n, n) largest std [rad] of the rotation between two cameras over all axes; independent of the gauge.
-
-    cameras: (18 n, 18 n) covariance of their parameters.
-    """
+def relative_rotation_stds(cov: CameraCovariance, state: AdjustmentState) -> Floats:
+    """(n, n) largest std [rad] of the rotation between two cameras over all axes; independent of the gauge."""
     count = len(state.cameras)
     out = np.zeros((count, count))
-    blocks = cameras.reshape(count, CAMERA_PARAMETERS, count, CAMERA_PARAMETERS)[:, :3, :, :3].transpose(0, 2, 1, 3)
+    blocks = cov.of_each_camera(0, 1, 2).reshape(count, 3, count, 3).transpose(0, 2, 1, 3)
     own = np.array([blocks[i, i] for i in range(count)])
     turned = np.array([camera.pose.rotation.T for camera in state.cameras])
     for i in range(1, count):
@@ -135,7 +195,7 @@ def gauge_generators(poses: list[Pose]) -> Floats:
     return np.concatenate(rows)
 
 
-def gauge_constraints(poses: list[Pose], control_information: Floats) -> Floats:
+def gauge_constraints(poses: list[Pose], control_information: BlockSum) -> Floats:
     """Constraint rows (q, 18 n) that fix the gauge directions that the control points leave free."""
     generators = gauge_generators(poses)
     default = np.zeros((7, len(generators)))
@@ -146,7 +206,7 @@ def gauge_constraints(poses: list[Pose], control_information: Floats) -> Floats:
     default[6, CAMERA_PARAMETERS + 3 : CAMERA_PARAMETERS + 6] = baseline
     # Generators scaled to unit norm, so that one threshold serves all seven.
     scaled = generators / np.linalg.norm(generators, axis=0)
-    prior_information = scaled.T @ control_information @ scaled
+    prior_information = scaled.T @ (control_information @ scaled)
     values, vectors = np.linalg.eigh(prior_information)
     free_directions = vectors[:, values < 1e-6 * max(float(values[-1]), 1e-30)] if values[-1] > 0 else np.eye(7)
     return np.asarray(free_directions.T @ np.linalg.inv(default @ scaled) @ default)
@@ -158,10 +218,9 @@ def time_map_std(cov: Covariance, state: AdjustmentState, camera: int, reference
         return 0.0
     now, base = state.cameras[camera], state.cameras[reference]
     at = float(base.camera_time(np.array([now.offset]))[0])
-    of_reference = reference * CAMERA_PARAMETERS
-    columns = [camera * CAMERA_PARAMETERS + OFFSET, of_reference + OFFSET, of_reference + RATE]
+    columns = [2 * camera, 2 * reference, 2 * reference + 1]
     row = np.array([1.0, -1.0, base.centre - at])
-    return float(np.sqrt(max(float(row @ cov.cameras[np.ix_(columns, columns)] @ row), 0.0)) / base.rate)
+    return float(np.sqrt(max(float(row @ cov.clocks[np.ix_(columns, columns)] @ row), 0.0)) / base.rate)
 
 
 def inner_constraints(a_inv_b: PathByCameras, state: AdjustmentState, datum_points: list[tuple[int, Floats]]) -> Floats:
@@ -191,12 +250,12 @@ def inner_constraints(a_inv_b: PathByCameras, state: AdjustmentState, datum_poin
 
 def clock_rate_std(cov: Covariance, state: AdjustmentState, camera: int, reference: int) -> float:
     """Std of the camera's clock rate relative to the reference camera's."""
-    columns = np.array([camera, reference]) * CAMERA_PARAMETERS + RATE
-    (own, shared), (_, other) = cov.cameras[np.ix_(columns, columns)]
+    columns = 2 * np.array([camera, reference]) + 1
+    (own, shared), (_, other) = cov.clocks[np.ix_(columns, columns)]
     return float(np.sqrt(max(own - 2.0 * shared + other, 0.0)) / state.cameras[reference].rate)
 
 
-def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentState) -> Floats:
+def relative_clock_stds(cov: CameraCovariance, problem: Problem, state: AdjustmentState) -> Floats:
     """Std [s] (cameras, cameras) of the relative clock offset of two cameras, in the middle of their common span.
 
     That is where their lag is used; away from it the uncertain rates increase the std. For cameras without a common
@@ -205,8 +264,7 @@ def relative_clock_stds(cov: Covariance, problem: Problem, state: AdjustmentStat
     middle = middles_of_overlap(problem, state)
     offsets, rates = (np.array([getattr(camera, name) for camera in state.cameras]) for name in ("offset", "rate"))
     change = (middle - offsets[:, None]) / rates[:, None]  # of a camera's (first index) map by its rate
-    both = ((OFFSET, OFFSET), (RATE, OFFSET), (RATE, RATE))
-    offset, mixed, rate = (cov.cameras[a::CAMERA_PARAMETERS, b::CAMERA_PARAMETERS] for a, b in both)
+    offset, mixed, rate = (cov.clocks[a::2, b::2] for a, b in ((0, 0), (1, 0), (1, 1)))
     own = np.diag(offset)[:, None] + 2.0 * change * np.diag(mixed)[:, None] + change**2 * np.diag(rate)[:, None]
     shared = offset + change * mixed + change.T * mixed.T + change * change.T * rate
     variance = own + own.T - 2.0 * shared
@@ -226,17 +284,16 @@ def middles_of_overlap(problem: Problem, state: AdjustmentState) -> Floats:
 
 def position_std(cov: Covariance, camera: int) -> Floats:
     """Std (3,) of the camera's position."""
-    begin = camera * CAMERA_PARAMETERS + 3
-    variance = np.diag(cov.cameras)[begin : begin + 3]
+    variance = cov.variances[camera, 3:6]
     # A coordinate fixed by the gauge comes out of the null space as 1e-30: its variance is 0 by definition.
-    return np.asarray(np.sqrt(np.where(variance > 1e-20 * float(np.diag(cov.cameras).max(initial=0.0)), variance, 0.0)))
+    return np.asarray(np.sqrt(np.where(variance > 1e-20 * float(cov.variances.max(initial=0.0)), variance, 0.0)))
 
 
 def path_std(cov: Covariance, state: AdjustmentState, label: int, time: Floats) -> Floats:
     """Std (n,) of a path at internal reference times (n,): one for three axes, see `equivalent_std`."""
     index, weights, _ = state.trajectories[label].basis.weights(time)
     rows, columns, by_cameras = cov.a_inv_b.parts[label]
-    free = cov.free[np.ix_(columns, columns)]
+    free = cov.free.submatrix(columns)
     first = rows.start + 3 * index
     block, inside = first // BAND, first % BAND
     out = np.zeros((len(time), 3))
@@ -285,18 +342,4 @@ def _inverse_blocks(band: Floats) -> Floats:
         above[row[~same] // BAND, row[~same] % BAND, column[~same] % BAND] = values[~same]
     on_diagonal = np.einsum("kii->ki", diagonal)
     on_diagonal += regularisation(on_diagonal.ravel()).reshape(on_diagonal.shape)
-    pivots = np.empty_like(diagonal)
-    pivots[0] = np.linalg.inv(diagonal[0])
-    for i in range(1, count):
-        pivots[i] = np.linalg.inv(diagonal[i] - above[i - 1].T @ pivots[i - 1] @ above[i - 1])
-    out = np.zeros((count, 2 * BAND, 2 * BAND))
-    last = pivots[-1]
-    out[-1, :BAND, :BAND] = last
-    for i in range(count - 2, -1, -1):
-        carry = pivots[i] @ above[i]
-        corner = -carry @ last
-        now = pivots[i] - corner @ carry.T
-        out[i, :BAND, :BAND], out[i, BAND:, BAND:] = now, last
-        out[i, :BAND, BAND:], out[i, BAND:, :BAND] = corner, corner.T
-        last = now
-    return out
+    return BlockTridiagonal.of(diagonal, above).inverse_blocks()

@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.bundle.adjustment import apply_step, gauge
+from hub.bundle.block_matrix import BlockSum, ParameterCovariance
 from hub.bundle.bordered_system import PathBlocks, add_row_sums
 from hub.bundle.covariance import constrained_step
 from hub.bundle.datum.gauge import ControlPointTerms
 from hub.bundle.gauss_markov import GaussMarkov
-from hub.bundle.normal_equations import camera_priors
+from hub.bundle.normal_equations import camera_priors, prior_terms
 from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, CorrelatedNoise, Problem, TrackObservations
 from hub.bundle.residuals import evaluate_residuals, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, smoothness_cost, smoothness_terms
@@ -47,15 +48,7 @@ class GlsSolution:
 
     state: AdjustmentState
     cost: float
-    free: Floats
-
-    def covariance_of(self, problem: Problem) -> Floats:
-        """(18 n, 18 n) covariance of all camera parameters, zero where one is fixed."""
-        columns = problem.free_columns()
-        width = len(self.state.cameras) * CAMERA_PARAMETERS
-        full = np.zeros((width, width))
-        full[np.ix_(columns, columns)] = self.free
-        return full
+    free: ParameterCovariance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,7 +225,7 @@ def _step(
     parts: list[_NoiseBlock],
     control_terms: Callable[[AdjustmentState], ControlPointTerms] | None,
     constraints: Callable[[AdjustmentState], tuple[Floats, Floats]] | None,
-) -> tuple[Floats, Floats, Floats, bool]:
+) -> tuple[Floats, Floats, ParameterCovariance, bool]:
     """Steps of the paths (3 n,) and the free camera parameters (p,), the covariance (p, p) of these, and whether the
     state is off the constraints."""
     columns = problem.free_columns()
@@ -269,14 +262,11 @@ def _step(
             first_knot += len(part.knots)
     gradient[:paths] += np.concatenate([one[1] for one in motion])
     entries.add_band(blocks.band() + np.concatenate([one[0] for one in motion], axis=1), 0)
-    column_index = {int(column): i for i, column in enumerate(columns)}
-    for column, value, std in camera_priors(problem, state):
-        if column in column_index:
-            corner[column_index[column], column_index[column]] += 1.0 / std**2
-            camera_gradient[column_index[column]] += value / std**2
+    given, pull = prior_terms(problem, state)
+    camera_gradient += pull
     if control_terms is not None:
         control_at_state = control_terms(state)
-        corner += control_at_state.information[np.ix_(columns, columns)]
+        given += control_at_state.information.restricted(columns)
         camera_gradient += control_at_state.gradient[columns]
     solution = _solve_banded(entries, _time_order(state, parts), np.column_stack([border, gradient]))
     reduced, right_side = corner - border.T @ solution[:, :-1], border.T @ solution[:, -1] - camera_gradient
@@ -286,7 +276,8 @@ def _step(
     else:
         directions, values = constraints(state)
         fixed = directions[:, columns]
-    cameras, covariance = constrained_step(reduced, right_side, fixed, values)
+    normal = given + BlockSum(np.zeros(len(columns)), ((np.arange(len(columns)), reduced),))
+    cameras, covariance = constrained_step(normal, right_side, fixed, values)
     must = bool(np.abs(values).max(initial=0.0) > _ON_CONSTRAINTS)
     return -(solution[:, -1] + solution[:, :-1] @ cameras)[:paths], cameras, covariance, must
 

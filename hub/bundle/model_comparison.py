@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from hub.bundle.adjustment import apply_step, estimate_noise, gauge
+from hub.bundle.block_matrix import BlockSum, ParameterCovariance
 from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, eliminate
 from hub.bundle.correlated_noise import MIN_INFLATION, lens_tolerance
 from hub.bundle.covariance import constrained_step
@@ -56,6 +57,7 @@ _STEP_CAMERAS = 3
 _TRIED_SHARE = 0.4
 """Of the statistic that is needed: in noise that holds its own effect a real step has less; on recorded flights those
 of 40 and 60 ms have 0.6 and more of it, and what is none at most 0.3."""
+_TESTED_AT_ONCE = 64  # cameras: of all, their columns would be as large as the matrix
 REFUTED_SIGMA = 4.0
 """Stds from which a rate is no crystal's: of a hundred cameras with crystals one in 160 is refuted."""
 _WIDE_FOCAL_STD, _WIDE_K1_STD = 0.5, 0.2
@@ -101,7 +103,7 @@ def refuted_lenses(problem: Problem, state: AdjustmentState) -> list[ScoreTest]:
 
 
 def _forward_selection(
-    normal: Floats, gradient: Floats, fixed: Floats, candidates: dict[int, Ints], limit: float
+    normal: BlockSum, gradient: Floats, fixed: Floats, candidates: dict[int, Ints], limit: float
 ) -> list[ScoreTest]:
     """Tests of the cameras whose parameters, freed one after the other, lower the cost by more than ``limit`` each.
 
@@ -111,15 +113,22 @@ def _forward_selection(
     kept = np.setdiff1d(np.arange(len(gradient)), np.concatenate([np.zeros(0, dtype=np.int64), *candidates.values()]))
     out: list[ScoreTest] = []
     while len(out) < len(candidates):
-        step, covariance = _reduction(normal, gradient, fixed, kept)
-        found = []
-        for camera in candidates.keys() - {one.camera for one in out}:
-            # What some parameters more lower the cost by: one step of them beside all others (Schur complement).
-            own = candidates[camera]
-            left = gradient[own] + normal[own] @ step
-            inverse = np.linalg.inv(normal[np.ix_(own, own)] - normal[own] @ covariance @ normal[:, own])
-            statistic, std = float(left @ inverse @ left), float(np.sqrt(inverse[0, 0]))
-            found.append(ScoreTest(camera, -float(inverse[0] @ left), std, statistic, limit))
+        step, covariance = constrained_step(
+            normal.restricted(kept), -gradient[kept], fixed[:, kept], np.zeros(len(fixed))
+        )
+        found, rest = [], sorted(candidates.keys() - {one.camera for one in out})
+        for first in range(0, len(rest), _TESTED_AT_ONCE):
+            some = rest[first : first + _TESTED_AT_ONCE]
+            columns = normal.columns(np.concatenate([candidates[camera] for camera in some]))
+            known, end = covariance @ columns[kept], 0
+            for camera in some:
+                # What some parameters more lower the cost by: one step of them beside all others (Schur complement).
+                own, mine = candidates[camera], slice(end, end + len(candidates[camera]))
+                coupling, end = columns[kept, mine], mine.stop
+                left = gradient[own] + coupling.T @ step
+                inverse = np.linalg.inv(columns[own, mine] - coupling.T @ known[:, mine])
+                statistic, std = float(left @ inverse @ left), float(np.sqrt(inverse[0, 0]))
+                found.append(ScoreTest(camera, -float(inverse[0] @ left), std, statistic, limit))
         best = max(found, key=lambda one: one.statistic)
         if not best.statistic > limit:
             break
@@ -140,8 +149,9 @@ def with_crystal_rates(problem: Problem, state: AdjustmentState) -> Problem:
     inflation = correlation_inflation(problem, state)
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
     columns, normal, gradient = _reduced_system(wide, noisy, estimate_smoothness(problem, state))
-    covariance = _reduction(normal, gradient, gauge(wide, state), np.arange(len(columns)))[1]
-    variance = dict(zip(columns.tolist(), np.diag(covariance).tolist(), strict=True))
+    fixed = gauge(wide, state)
+    _, covariance = constrained_step(normal, -gradient, fixed, np.zeros(len(fixed)))
+    variance = dict(zip(columns.tolist(), covariance.diagonal().tolist(), strict=True))
     reference = state.cameras[problem.clock_reference].rate
     crystal = tuple(
         (camera.rate - reference) ** 2
@@ -183,8 +193,9 @@ def are_readouts_supported(problem: Problem, state: AdjustmentState) -> bool:
         _evidence_needed(problem, 1, len(state.cameras)),
     )
     values = {column: state.cameras[camera].readout for camera, (column,) in linear.readouts().items()}
+    variance = linear.covariance.diagonal()
     return are_readouts_plausible(problem, state) and any(
-        value**2 > needed * linear.covariance[column, column] for column, value in values.items()
+        value**2 > needed * variance[column] for column, value in values.items()
     )
 
 
@@ -209,7 +220,7 @@ def without_negative_readouts(problem: Problem, state: AdjustmentState) -> tuple
     return replace(problem, readout_given=held), replace(state, cameras=tuple(cameras))
 
 
-def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> tuple[Ints, Floats, Floats]:
+def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> tuple[Ints, BlockSum, Floats]:
     """Free columns (p,), normal matrix (p, p) and gradient (p,) of the camera parameters, the paths eliminated."""
     system, _ = build_system(problem, state, prior, robust=False)
     parts = eliminate(system)
@@ -217,18 +228,6 @@ def _reduced_system(problem: Problem, state: AdjustmentState, prior: SmoothnessP
         cho_solve_banded(parts.factor, system.gradient_path)
     )
     return problem.free_columns(), parts.reduced, gradient
-
-
-def _reduction(normal: Floats, gradient: Floats, fixed: Floats, kept: Ints) -> tuple[Floats, Floats]:
-    """One step (p,) of the parameters ``kept``, and its covariance (p, p).
-
-    fixed: (q, p) directions of the gauge, of poses only.
-    """
-    step, covariance = np.zeros_like(gradient), np.zeros_like(normal)
-    step[kept], covariance[np.ix_(kept, kept)] = constrained_step(
-        normal[np.ix_(kept, kept)], -gradient[kept], fixed[:, kept], np.zeros(len(fixed))
-    )
-    return step, covariance
 
 
 def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | None:
@@ -363,7 +362,7 @@ class _Linearised:
     parts: Elimination
     path: Floats
     gradient: Floats
-    covariance: Floats
+    covariance: ParameterCovariance
 
     @classmethod
     def of(cls, problem: Problem, state: AdjustmentState, sigma: Floats) -> _Linearised:
@@ -416,7 +415,7 @@ class _Linearised:
         information = np.maximum(information - (coupling * (self.covariance @ coupling)).sum(axis=0), 1e-9)
         k = int(np.argmax(score**2 / information))
         change, rate = float(score[k] / information[k]), float(state.cameras[camera].rate)
-        cameras = -self.covariance @ (self.gradient - coupling[:, k] * change)
+        cameras = -(self.covariance @ (self.gradient - coupling[:, k] * change))
         path = -(self.path + self.parts.a_inv_b @ cameras - solved[:, k] * change)
         statistic = float(score[k] ** 2 / information[k])
         step = ClockStep(camera, float(times[k]), change / rate, float(information[k] ** -0.5) / rate, statistic)

@@ -70,13 +70,13 @@ def _hat_matrix_trace(problem: Problem, state: AdjustmentState, found: Covarianc
     w, n = line.weights, len(line.index)
     point = np.einsum("na,naibj,nb->nij", w, blocks.reshape(n, SUPPORT, 3, SUPPORT, 3), w, optimize=True)
     trace = float(np.einsum("npi,nij,npj->", line.point_jacobian, point, line.point_jacobian, optimize=True))
-    if found.free.size:
+    if len(found.columns):
         sensitivity = by_cameras[3 * line.index[:, None] + np.arange(BAND)].reshape(n, SUPPORT, 3, len(columns))
         shift = -line.point_jacobian @ np.einsum("na,naip->nip", w, sensitivity)
         parameters = problem.free_columns()[columns]
         own = np.flatnonzero(parameters // CAMERA_PARAMETERS == rows.camera)
         shift[:, :, own] += line.camera_jacobian[:, :, parameters[own] % CAMERA_PARAMETERS]
-        free = found.free[np.ix_(columns, columns)]
+        free = found.free.submatrix(columns)
         trace += float(np.einsum("npi,ij,npj->", shift, free, shift, optimize=True))
     return trace / float(state.sigma[rows.camera]) ** 2 * len(used) / len(pick)
 

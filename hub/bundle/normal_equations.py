@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from hub.bundle.block_matrix import BlockSum
 from hub.bundle.bordered_system import BAND, BorderedSystem, PathBlocks, PathByCameras
 from hub.bundle.problem import (
     ASPECT,
@@ -28,7 +29,7 @@ from hub.bundle.problem import (
 from hub.bundle.residuals import ResidualEvaluation, StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, smoothness_cost, smoothness_terms
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Ints
 
 CAUCHY_WIDTH = 4.0
 """Cauchy width in sigma of the 2-D residual: nearly efficient for Gaussian noise."""
@@ -87,13 +88,15 @@ def assemble(
     """The normal equations at a state whose rows are ``residuals``."""
     first_rows = np.r_[0, np.cumsum([3 * path.basis.size for path in state.trajectories])].astype(int)
     columns = problem.free_columns()
-    corner, gradient_cameras = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+    corner, gradient_cameras = list[tuple[Ints, Floats]](), np.zeros(len(columns))
     band, gradient_path = np.zeros((BAND, first_rows[-1])), np.zeros(first_rows[-1])
     blocks = [PathBlocks(path.basis.size) for path in state.trajectories]
     border: list[dict[int, Floats]] = [{} for _ in blocks]
     columns_of = {camera: np.flatnonzero(columns // CAMERA_PARAMETERS == camera) for camera in residuals.cameras}
     for camera, one, weight in zip(residuals.cameras, residuals.evaluations, residuals.weights, strict=True):
         own = columns_of[camera]
+        of_camera = np.zeros((len(own), len(own)))
+        corner.append((own, of_camera))
         jacobian = jacobians(one, state.cameras[camera], (columns[own] % CAMERA_PARAMETERS).tolist())
         residual = one.whitened(one.residual)
         root, labels = np.sqrt(weight), np.searchsorted(first_rows, 3 * one.index, side="right") - 1
@@ -108,7 +111,7 @@ def assemble(
             gradient_path[first_rows[label] : first_rows[label + 1]] += path_terms[:, -1]
             before = border[label].get(camera)
             border[label][camera] = path_terms[:, :-1] if before is None else before + path_terms[:, :-1]
-            corner[np.ix_(own, own)] += camera_terms[:-1, :-1]
+            of_camera += camera_terms[:-1, :-1]
             gradient_cameras[own] += camera_terms[:-1, -1]
     parts = []
     for label, path in enumerate(state.trajectories):
@@ -119,13 +122,24 @@ def assemble(
         seeing = [np.zeros(0, dtype=np.int64), *(columns_of[camera] for camera in border[label])]
         block = np.concatenate([np.zeros((len(gradient), 0)), *border[label].values()], axis=1)
         parts.append((rows_of_label, np.concatenate(seeing), block))
-    system = BorderedSystem(band, PathByCameras(tuple(parts), len(columns)), corner, gradient_path, gradient_cameras)
-    column_index = {int(column): i for i, column in enumerate(columns)}
+    priors, gradient = prior_terms(problem, state)
+    return BorderedSystem(
+        band,
+        PathByCameras(tuple(parts), len(columns)),
+        priors + BlockSum(np.zeros(len(columns)), tuple(corner)),
+        gradient_path,
+        gradient_cameras + gradient,
+    )
+
+
+def prior_terms(problem: Problem, state: AdjustmentState) -> tuple[BlockSum, Floats]:
+    """Information (p, p) and gradient (p,) of the priors on the free camera parameters."""
+    information, gradient = np.zeros((2, len(state.cameras) * CAMERA_PARAMETERS))
     for column, value, std in camera_priors(problem, state):
-        if column in column_index:
-            system.corner[column_index[column], column_index[column]] += 1.0 / std**2
-            system.gradient_cameras[column_index[column]] += value / std**2
-    return system
+        information[column] += 1.0 / std**2
+        gradient[column] += value / std**2
+    columns = problem.free_columns()
+    return BlockSum(information[columns]), gradient[columns]
 
 
 def camera_priors(problem: Problem, state: AdjustmentState) -> list[tuple[int, float, float]]:

@@ -163,7 +163,7 @@ def _focal_lengths(reconstruction: Reconstruction, found: cov.Covariance) -> Cam
 def _precision(reconstruction: Reconstruction, found: cov.Covariance) -> CameraTests:
     """Precision of each camera's orientation and clock relative to the camera to which they are known best."""
     problem, state = reconstruction.problem, reconstruction.state
-    rotations = _best(cov.relative_rotation_stds(found.cameras, state))
+    rotations = _best(cov.relative_rotation_stds(found, state))
     shared = not problem.free_parameters.clock
     clocks = np.zeros_like(rotations) if shared else _best(cov.relative_clock_stds(found, problem, state))
     only = "the common motion determines its"

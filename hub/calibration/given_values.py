@@ -57,9 +57,8 @@ def sensitivities(
     if held:
         freed = replace(problem, free_parameters=replace(free, lens=True))
         normal, columns = eliminate(build_system(freed, state, prior, robust=False)[0]).reduced, freed.free_columns()
-        rows = np.searchsorted(columns, base)
-        focal = np.searchsorted(columns, np.array(held) * CAMERA_PARAMETERS + FOCAL)
-        changes = -found.cameras[:, base] @ normal[np.ix_(rows, focal)] * _LENS_STD
+        focal = normal.columns(np.searchsorted(columns, np.array(held) * CAMERA_PARAMETERS + FOCAL))
+        changes = found.spread(found.free @ focal[np.searchsorted(columns, base)] * -_LENS_STD)
         lenses = dict(zip(held, changes.T, strict=True))
     out: list[tuple[Sensitivity, ...]] = []
     for i, name in enumerate(names):
@@ -68,8 +67,8 @@ def sensitivities(
             value = camera.position if given == "position" else camera.rotation
             if value is None or std is None or not (std > 0.0).all():
                 continue
-            at = i * CAMERA_PARAMETERS + first
-            moved = [(found.cameras[:, at + k] / std[k], float(std[k])) for k in range(3)]
+            axes = (base[:, None] == i * CAMERA_PARAMETERS + first + np.arange(3)) / std
+            moved = zip(found.spread(found.free @ axes).T, std.tolist(), strict=True)
             effects = [_effect(given, one, change, names, problem) for change, one in moved]
             mine.append(max(effects, key=lambda effect: effect.position))
         if i in lenses:

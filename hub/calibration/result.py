@@ -16,7 +16,7 @@ from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation
 from hub.bundle.model_comparison import REFUTED_SIGMA
 from hub.bundle.noise_scale import rescale_noise
 from hub.bundle.preprocessing import PreparedSession
-from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
+from hub.bundle.problem import CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.bundle.timestamp_jitter import weighted_by_jitter
@@ -60,7 +60,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         rig, control_outliers = reject_outliers(rig, names, [camera.pose for camera in state.cameras])
         if is_overdetermined(rig, names) and problem.free_parameters.pose:
             prior = estimate_smoothness(problem, state)
-            network = cov.covariance(problem, rescale_noise(problem, state, prior), prior).cameras
+            network = cov.covariance(problem, rescale_noise(problem, state, prior), prior).of_each_camera(*range(6))
             rig, refuted = reject_refuted(rig, names, [camera.pose for camera in state.cameras], network)
             control_outliers += refuted
         gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
@@ -90,7 +90,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     covariance = cov.covariance(noisy, scaled, prior, gauge.information, datum_points, gauge.exact)
     effects = sensitivities(rig, names, noisy, scaled, prior, covariance)
     lens_stds = focal_stds(problem, state, covariance)
-    readout_stds = np.sqrt(np.maximum(np.diag(covariance.cameras)[READOUT::CAMERA_PARAMETERS], 0.0))
+    readout_stds = np.sqrt(np.maximum(covariance.variances[:, READOUT], 0.0))
     time_origins = [solution.prepared.time_origins[name] for name in names]
     time_scales = [solution.prepared.time_scale(name) for name in names]
     base = state.cameras[reference]
@@ -231,8 +231,7 @@ def focal_stds(problem: Problem, state: AdjustmentState, covariance: cov.Covaria
     if not any(is_estimated):
         return np.zeros(len(is_estimated))
     found = covariance or cov.covariance(problem, state, estimate_smoothness(problem, state))
-    variance = np.diag(found.cameras)[FOCAL::CAMERA_PARAMETERS]
-    return np.where(is_estimated, np.sqrt(np.maximum(variance, 0.0)), 0.0)
+    return np.where(is_estimated, np.sqrt(np.maximum(found.variances[:, FOCAL], 0.0)), 0.0)
 
 
 def _estimated_lenses(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:

@@ -15,7 +15,6 @@ from hub.bundle.datum.gauge import (
     control_points_of,
     fit_to_control_points,
 )
-from hub.bundle.problem import CAMERA_PARAMETERS
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats
@@ -158,7 +157,7 @@ def _describe(rig: Rig, names: list[str], poses: list[Pose], item: ControlItem, 
 def reject_refuted(rig: Rig, names: list[str], poses: list[Pose], network: Floats) -> tuple[Rig, tuple[str, ...]]:
     """The rig without references (positions and attitudes of a camera) that the network refutes, and their names.
 
-    poses: of the solved cameras in any world and unit. network: (18 n, 18 n) covariance of their parameters there, by
+    poses: of the solved cameras in any world and unit. network: (6 n, 6 n) covariance of their poses there, by
     the observations alone. Data snooping (Baarda): the error of one camera's reference is freed at a time; its
     chi-squared has the stds of the references and of the network in it. Where the errors of two cameras explain the
     contradiction alike, neither is rejected, and both are named. References without std are named and kept.
@@ -171,7 +170,7 @@ def reject_refuted(rig: Rig, names: list[str], poses: list[Pose], network: Float
     residual, jacobian, design, variance, owner = [], [], [], [], []
     floor = 1e-6 * max(float(np.linalg.norm(np.ptp([pose.position for pose in published], axis=0))), 1e-9)
     for i, name in enumerate(names):
-        camera, base = rig.cameras[name], i * CAMERA_PARAMETERS
+        camera, base = rig.cameras[name], 6 * i
         for known, std, first in ((camera.position, camera.position_std, 3), (camera.rotation, camera.rotation_std, 0)):
             if known is None:
                 continue

@@ -52,9 +52,8 @@ def adjust_to_control_points(
         path = cho_solve_banded(parts.factor, system.gradient_path)
         gradient = system.gradient_cameras - system.border.transposed_times(path) + now.gradient[columns]
         rows, values = constraints(state)
-        step, _ = constrained_step(
-            parts.reduced + now.information[np.ix_(columns, columns)], -gradient, rows[:, columns], values
-        )
+        normal = parts.reduced + now.information.restricted(columns)
+        step, _ = constrained_step(normal, -gradient, rows[:, columns], values)
         # A state off the constraints has to move onto them, whatever that costs.
         must = bool(np.abs(values).max(initial=0.0) > 1e-9 * _size(state))
         shrink, better = 1.0, False

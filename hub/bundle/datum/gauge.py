@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hub.bundle.block_matrix import BlockSum
 from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState
 from protocols.core.errors import Refused
 from protocols.geometry import so3
@@ -38,7 +39,7 @@ class Gauge:
 
     similarity: Similarity
     scale: str
-    information: Floats
+    information: BlockSum
     exact: Floats
     warnings: tuple[str, ...]
 
@@ -53,9 +54,8 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
             warnings = (
                 "the control points fix no scale, so the first camera is the world: give two positions or a distance",
             )
-        return Gauge(
-            _default_datum(rig, names, poses), "arbitrary", np.zeros((width, width)), np.zeros((0, width)), warnings
-        )
+        none = BlockSum(np.zeros(width))
+        return Gauge(_default_datum(rig, names, poses), "arbitrary", none, np.zeros((0, width)), warnings)
     best, final = fit_to_control_points(rig, names, poses)
     found = []
     if len(final) and float(np.sqrt(np.mean(final**2))) > CONTRADICTION_SIGMA:
@@ -143,7 +143,8 @@ def _worst_control_point(
 def identity_gauge(cameras: int, scale: str) -> Gauge:
     """The gauge of given poses: the identity."""
     width = CAMERA_PARAMETERS * cameras
-    return Gauge(Similarity(1.0, np.eye(3), np.zeros(3)), scale, np.zeros((width, width)), np.zeros((0, width)), ())
+    none = BlockSum(np.zeros(width))
+    return Gauge(Similarity(1.0, np.eye(3), np.zeros(3)), scale, none, np.zeros((0, width)), ())
 
 
 def _default_datum(rig: Rig, names: list[str], poses: list[Pose]) -> Similarity:
@@ -281,7 +282,7 @@ class ControlPointTerms:
     information: (18 n, 18 n). gradient: (18 n,) of half the cost. cost: sum of squared residuals in sigma.
     """
 
-    information: Floats
+    information: BlockSum
     gradient: Floats
     cost: float
 
@@ -292,7 +293,8 @@ def control_point_terms(rig: Rig, names: list[str], poses: list[Pose], exact: bo
     exact: whether control points without std are among them, with a small one.
     """
     width = CAMERA_PARAMETERS * len(names)
-    information, gradient, cost = np.zeros((width, width)), np.zeros(width), 0.0
+    information, gradient, cost = np.zeros(width), np.zeros(width), 0.0
+    between = []
     size = _extent(poses)
     for i, name in enumerate(names):
         camera, base = rig.cameras[name], i * CAMERA_PARAMETERS
@@ -306,16 +308,17 @@ def control_point_terms(rig: Rig, names: list[str], poses: list[Pose], exact: bo
         for begin, off, given, small in terms:
             axes = np.arange(3) if exact else np.flatnonzero(np.zeros(3) if given is None else given > 0.0)
             at, std = begin + axes, _std_or_exact(given, small)[axes]
-            information[at, at] += 1.0 / std**2
+            information[at] += 1.0 / std**2
             gradient[at] += off[axes] / std**2
             cost += float(((off[axes] / std) ** 2).sum())
     for a, b, length in rig.distances if exact else ():
         if a in names and b in names:
             row, far = _distance_row(names.index(a), names.index(b), poses)
-            information += np.outer(row, row) / (_EXACT_STD * length) ** 2
+            own = np.flatnonzero(row)
+            between.append((own, np.outer(row[own], row[own]) / (_EXACT_STD * length) ** 2))
             gradient += row * (far - length) / (_EXACT_STD * length) ** 2
             cost += ((far - length) / (_EXACT_STD * length)) ** 2
-    return ControlPointTerms(information, gradient, cost)
+    return ControlPointTerms(BlockSum(information, tuple(between)), gradient, cost)
 
 
 def exact_constraints(rig: Rig, names: list[str], poses: list[Pose]) -> tuple[Floats, Floats]:

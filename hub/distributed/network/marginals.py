@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hub.bundle.block_matrix import BlockSum
 from hub.bundle.covariance import gauge_constraints
 from hub.bundle.problem import CAMERA_PARAMETERS
 from hub.distributed.factors.factor import QuadraticFactor
@@ -45,7 +46,7 @@ def connected_cameras(names: list[str], edges: Edges) -> set[str]:
 
 
 def position_stds(
-    poses: Mapping[str, Pose], edges: Edges, world: Similarity, control_information: Floats
+    poses: Mapping[str, Pose], edges: Edges, world: Similarity, control_information: BlockSum
 ) -> dict[str, Floats]:
     """Std (3,) of each camera's position in the world, from the joint covariance over all cameras and edges.
 
@@ -84,7 +85,7 @@ def position_stds(
     pose_columns = np.concatenate([CAMERA_PARAMETERS * i + np.arange(6) for i in range(len(names))])
     constraints = gauge_constraints([world.pose(pose) for pose in poses.values()], control_information)[:, pose_columns]
     constraints = np.concatenate([constraints, np.zeros((len(constraints), 1))], axis=1)
-    information[:-1, :-1] += control_information[np.ix_(pose_columns, pose_columns)]
+    information[:-1, :-1] += control_information.restricted(pose_columns).dense()
     variance = _constrained_variances(information, constraints)
     return {name: np.sqrt(variance[6 * i + 3 : 6 * i + 6]) for name, i in at.items()}
 

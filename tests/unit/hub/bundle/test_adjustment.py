@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.linalg import null_space
 
-from hub.bundle import bordered_system
 from hub.bundle.adjustment import adjust, apply_step, gauge
-from hub.bundle.bordered_system import BAND, BorderedSystem, PathByCameras, eliminate, solve
-from hub.bundle.covariance import _inverse_blocks
+from hub.bundle.block_matrix import BlockSum, SparseCovariance
+from hub.bundle.bordered_system import BAND, BorderedSystem, PathByCameras, border_block, eliminate, solve
+from hub.bundle.covariance import _inverse_blocks, constrained_step
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
     ASPECT,
@@ -166,10 +166,10 @@ def dense(system: BorderedSystem) -> Floats:
         rows = np.arange(size - distance)
         values = system.band[BAND - 1 - distance, distance:]
         full[rows, rows + distance] = full[rows + distance, rows] = values
-    border = np.zeros((size, len(system.corner)))
+    border = np.zeros((size, system.corner.size))
     for part, columns, block in system.border.parts:
         border[part, columns] = block
-    return np.block([[full, border], [border.T, system.corner]])
+    return np.block([[full, border], [border.T, system.corner.dense()]])
 
 
 def test_the_banded_normal_matrix_equals_the_dense_one() -> None:
@@ -202,7 +202,7 @@ def test_the_priors_add_their_information() -> None:
     loose = replace(problem, free_parameters=FreeParameters(lens=True, rate_std=1e9, focal_std=1e9, k1_std=1e9))
     with_priors, _ = build_system(problem, state, prior, robust=False)
     without, _ = build_system(loose, state, prior, robust=False)
-    gained = np.diag(with_priors.corner - without.corner)
+    gained = with_priors.corner.diagonal() - without.corner.diagonal()
     free_parameters = problem.free_parameters
     for value, column in zip(gained, problem.free_columns(), strict=True):
         std = {RATE: free_parameters.rate_std, FOCAL: free_parameters.focal_std, K1: free_parameters.k1_std}.get(
@@ -222,7 +222,9 @@ def test_an_unmeasured_lens_is_free_under_its_own_prior_and_the_others_are_not()
         one, lens_priors=(None, LensPrior(lens.focal, 1e9, (0.0, 0.0), 1e9, 0.0, 1e9, 0.0, 1e9, 1e9, 1e9, 1e9), None)
     )
     (with_prior, cost), (without, bare) = (build_system(p, state, prior, robust=False) for p in (one, loose))
-    gained = dict(zip(one.free_columns().tolist(), np.diag(with_prior.corner - without.corner), strict=True))
+    gained = dict(
+        zip(one.free_columns().tolist(), with_prior.corner.diagonal() - without.corner.diagonal(), strict=True)
+    )
     stds = {FOCAL: 0.2, CENTRE: 5.0, CENTRE + 1: 5.0, K1: 0.1, K2: 0.04, K3: 0.01, ASPECT: 2e-3, P1: 2e-3, P1 + 1: 2e-3}
     for column, value in gained.items():
         std = stds.get(column - CAMERA_PARAMETERS)
@@ -302,14 +304,14 @@ def test_the_schur_complement_equals_the_dense_one() -> None:
     size = system.band.shape[1]
     full = dense(system)
     expected = full[size:, size:] - full[size:, :size] @ np.linalg.solve(full[:size, :size], full[:size, size:])
-    np.testing.assert_allclose(parts.reduced, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(parts.reduced.dense(), expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
 def test_border_blocks_take_rows_in_any_order() -> None:
     rng = np.random.default_rng(0)
     index, weights = rng.integers(0, 20, 50), rng.random((50, 4))
     blocks = rng.normal(size=(50, 3, 5))
-    out = bordered_system.border_block(index, weights, blocks.transpose(1, 2, 0), 3 * 24)
+    out = border_block(index, weights, blocks.transpose(1, 2, 0), 3 * 24)
     expected = np.zeros((24, 3, 5))
     for n in range(50):
         for k in range(4):
@@ -416,7 +418,10 @@ def street_system(cameras: int, width: int = 8, size: int = 6) -> BorderedSystem
     for distance in range(BAND):
         band[BAND - 1 - distance, distance:] = np.diagonal(whole[:paths, :paths], distance)
     border, gradient = PathByCameras(tuple(parts), width * cameras), rng.normal(size=len(whole))
-    return BorderedSystem(band, border, whole[paths:, paths:], gradient[:paths], gradient[paths:])
+    own = [np.arange(width * camera, width * (camera + 1)) for camera in range(cameras)]
+    corner = tuple((columns, whole[np.ix_(paths + columns, paths + columns)]) for columns in own)
+    system = BlockSum(np.zeros(width * cameras), corner)
+    return BorderedSystem(band, border, system, gradient[:paths], gradient[paths:])
 
 
 @pytest.mark.parametrize("held", [True, False])
@@ -424,19 +429,42 @@ def test_the_step_of_cameras_that_overlap_few_others_equals_the_dense_one(
     held: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     system = street_system(24)
-    fixed = np.zeros((7 if held else 0, len(system.corner)))
+    fixed = np.zeros((7 if held else 0, system.corner.size))
     if held:
         fixed[np.arange(6), 40 + np.arange(6)] = 1.0
         fixed[6, 83:86] = [0.6, 0.0, -0.8]
     banded = solve(system, 1e-3, fixed)
-    monkeypatch.setattr(bordered_system, "_solve_banded_cameras", None)  # it is what was called
-    with pytest.raises(TypeError):
-        solve(system, 1e-3, fixed)
-    monkeypatch.setattr(bordered_system, "_narrowest_order", lambda groups, size: (np.arange(size), size))
+    assert eliminate(system).reduced.factored() is not None  # else it is dense
+    monkeypatch.setattr(BlockSum, "factored", lambda matrix: None)
     for ours, expected in zip(banded, solve(system, 1e-3, fixed), strict=True):
         np.testing.assert_allclose(ours, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
     assert np.abs(fixed @ banded[1]).max(initial=0.0) < 1e-12 * np.abs(banded[1]).max()
     monkeypatch.undo()
-    system.corner[30, 30] = -1e9
+    system.corner.on_diagonal[30] = -1e9
     with pytest.raises(np.linalg.LinAlgError):
         solve(system, 1e-3, fixed)
+
+
+@pytest.mark.parametrize("kind", ["few cameras", "all cameras", "none"])
+def test_the_covariance_of_cameras_that_overlap_few_others_equals_the_dense_one(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng, normal = np.random.default_rng(5), eliminate(street_system(24)).reduced
+    rows = np.zeros((0 if kind == "none" else 4, normal.size))
+    if kind == "few cameras":
+        rows[:, 40:52] = rng.normal(size=(4, 12))
+    elif kind == "all cameras":
+        rows = rng.normal(size=(4, normal.size))
+    right, values = rng.normal(size=normal.size), np.zeros(len(rows))
+    step, sparse = constrained_step(normal, right, rows, values)
+    assert isinstance(sparse, SparseCovariance)
+    monkeypatch.setattr(BlockSum, "factored", lambda matrix: None)
+    expected, dense_one = constrained_step(normal, right, rows, values)
+    every = np.arange(normal.size)
+    limits = {"rtol": 1e-6, "atol": 1e-9 * np.abs(dense_one.diagonal()).max()}
+    np.testing.assert_allclose(step, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(sparse.diagonal(), dense_one.diagonal(), **limits)
+    for columns in (every, every[40:52], every[[3, 150]], every[:0]):
+        np.testing.assert_allclose(sparse.submatrix(columns), dense_one.submatrix(columns), **limits)
+    block = rng.normal(size=(normal.size, 3))
+    np.testing.assert_allclose(sparse @ block, dense_one @ block, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
