@@ -18,7 +18,7 @@ from hub.bundle.block_matrix import BlockSum, ParameterCovariance
 from hub.bundle.bordered_system import PathBlocks, add_row_sums
 from hub.bundle.covariance import constrained_step
 from hub.bundle.datum.gauge import ControlPointTerms
-from hub.bundle.gauss_markov import GaussMarkov
+from hub.bundle.noise.gauss_markov import GaussMarkov
 from hub.bundle.normal_equations import camera_priors, prior_terms
 from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, CorrelatedNoise, Problem, TrackObservations
 from hub.bundle.residuals import evaluate_residuals, jacobians

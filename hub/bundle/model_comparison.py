@@ -19,10 +19,11 @@ from scipy.special import chdtri
 from hub.bundle.adjustment import apply_step, estimate_noise, gauge
 from hub.bundle.block_matrix import BlockSum, ParameterCovariance
 from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, eliminate
-from hub.bundle.correlated_noise import MIN_INFLATION, lens_tolerance
 from hub.bundle.covariance import constrained_step
-from hub.bundle.gauss_markov import estimate_correlated_noise
-from hub.bundle.noise_scale import correlation_inflation, modelled_inflation, score_inflation
+from hub.bundle.noise.correlated_noise import MIN_INFLATION, lens_tolerance
+from hub.bundle.noise.gauss_markov import estimate_correlated_noise
+from hub.bundle.noise.noise_scale import correlation_inflation, modelled_inflation, score_inflation
+from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
     CAMERA_PARAMETERS,
@@ -38,7 +39,6 @@ from hub.bundle.problem import (
 )
 from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
-from hub.bundle.timestamp_jitter import weighted_by_jitter
 from hub.trajectory.banded import cho_solve_banded
 from protocols.geometry.types import Floats, Ints
 

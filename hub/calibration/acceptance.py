@@ -7,10 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 
 from hub.bundle import covariance as cov
-from hub.bundle.correlated_noise import MIN_INFLATION
 from hub.bundle.initialisation import Reconstruction, inlier_share
 from hub.bundle.model_comparison import ScoreTest, refuted_lenses
-from hub.bundle.noise_scale import correlation_inflation
+from hub.bundle.noise.correlated_noise import MIN_INFLATION
+from hub.bundle.noise.noise_scale import correlation_inflation
 from hub.bundle.problem import AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens

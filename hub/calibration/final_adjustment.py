@@ -8,12 +8,12 @@ import numpy as np
 
 from hub.bundle import model_comparison
 from hub.bundle.adjustment import adjust
-from hub.bundle.correlated_noise import refit_with_correlated_noise
 from hub.bundle.initialisation import Reconstruction, sigma_limit
-from hub.bundle.noise_scale import correlation_inflation
+from hub.bundle.noise.correlated_noise import refit_with_correlated_noise
+from hub.bundle.noise.noise_scale import correlation_inflation
+from hub.bundle.noise.timestamp_jitter import estimate_frame_times
 from hub.bundle.problem import AdjustmentState, ClockStep, Problem
 from hub.bundle.residuals import residual_norms
-from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.acceptance import misfits, wrong_lens
 from hub.calibration.pairs.pair_network import Progress
 from protocols.geometry.types import Floats

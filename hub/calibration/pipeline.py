@@ -19,9 +19,9 @@ from hub.bundle.initialisation import (
     reconstruct_incrementally,
     reconstruct_with_known_poses,
 )
+from hub.bundle.noise.timestamp_jitter import estimate_frame_times
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
-from hub.bundle.timestamp_jitter import estimate_frame_times
 from hub.calibration.acceptance import (
     LAG_CONFLICT,
     CameraTests,

@@ -14,12 +14,12 @@ from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined,
 from hub.bundle.datum.held_gauge import similarity_to_published
 from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation_times, seen_by_two
 from hub.bundle.model_comparison import REFUTED_SIGMA
-from hub.bundle.noise_scale import rescale_noise
+from hub.bundle.noise.noise_scale import rescale_noise
+from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
 from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
-from hub.bundle.timestamp_jitter import weighted_by_jitter
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
 from hub.calibration.pairs.pair_network import RATE_TOLERANCE, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars

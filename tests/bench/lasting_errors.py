@@ -23,7 +23,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402
 from scipy.signal import lfilter  # noqa: E402
 
-from hub.bundle.correlated_noise import refit_with_correlated_noise  # noqa: E402
+from hub.bundle.noise.correlated_noise import refit_with_correlated_noise  # noqa: E402
 from hub.bundle.problem import AdjustmentState, Problem  # noqa: E402
 from hub.calibration.pipeline import calibrate  # noqa: E402
 from protocols.core.clocks import TimeMap  # noqa: E402

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hub.bundle import correlated_noise
 from hub.bundle.adjustment import adjust, apply_step
 from hub.bundle.block_matrix import DenseCovariance
-from hub.bundle.correlated_noise import lens_tolerance, prefers_nominal_lenses, refit_with_correlated_noise
 from hub.bundle.covariance import CameraCovariance, covariance
-from hub.bundle.gauss_markov import GaussMarkov, estimate_correlated_noise, fit_maximum_likelihood
 from hub.bundle.gls import GlsSolution, SparseEntries, gls_cost, is_tractable, solve_gls
-from hub.bundle.noise_scale import correlation_inflation, modelled_inflation, rescale_noise
+from hub.bundle.noise import correlated_noise
+from hub.bundle.noise.correlated_noise import lens_tolerance, prefers_nominal_lenses, refit_with_correlated_noise
+from hub.bundle.noise.gauss_markov import GaussMarkov, estimate_correlated_noise, fit_maximum_likelihood
+from hub.bundle.noise.noise_scale import correlation_inflation, modelled_inflation, rescale_noise
 from hub.bundle.problem import (
     FOCAL,
     AdjustmentState,

@@ -9,7 +9,7 @@ import pytest
 
 from hub.bundle.adjustment import adjust
 from hub.bundle.covariance import covariance
-from hub.bundle.noise_scale import _hat_matrix_trace, _serial_inflation, rescale_noise
+from hub.bundle.noise.noise_scale import _hat_matrix_trace, _serial_inflation, rescale_noise
 from hub.bundle.normal_equations import build_system
 from protocols.geometry.types import Floats
 from tests.unit.hub.bundle.test_adjustment import dense, simulated_problem

@@ -14,9 +14,9 @@ import numpy as np
 
 from hub.bundle.adjustment import estimate_noise
 from hub.bundle.covariance import CameraCovariance, relative_rotation_stds
-from hub.bundle.gauss_markov import estimate_correlated_noise
 from hub.bundle.gls import GlsSolution, is_tractable, solve_gls
-from hub.bundle.noise_scale import correlation_inflation
+from hub.bundle.noise.gauss_markov import estimate_correlated_noise
+from hub.bundle.noise.noise_scale import correlation_inflation
 from hub.bundle.normal_equations import camera_priors
 from hub.bundle.problem import (
     ASPECT,
