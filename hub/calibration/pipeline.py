@@ -41,7 +41,7 @@ from hub.calibration.pairs.pair_network import (
 from hub.calibration.result import assemble_calibration, isolated_pair_report
 from hub.calibration.self_calibration import initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
-from hub.calibration.unconnected import connect_by_resection
+from hub.calibration.unconnected import connect_by_resection, listed
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.sync.hypothesis import PairSolution
@@ -498,7 +498,7 @@ def _disconnected_reason(name: str, groups: list[list[str]], pairs: list[PairSol
     mine = next(group for group in groups if name in group)
     tried = describe_failures(name, pairs)
     if len(mine) > 1:
-        return f"connected only to {', '.join(other for other in mine if other != name)}, not to the rest ({tried})"
+        return f"connected only to {listed(other for other in mine if other != name)}, not to the rest ({tried})"
     return f"could not be connected to any camera ({tried})"
 
 

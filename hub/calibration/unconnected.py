@@ -7,7 +7,7 @@ reconstruction began, and times made with a wrong frame rate.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from hub.bundle.initialisation import Reconstruction, place_cameras
 from hub.bundle.preprocessing import PreparedSession
@@ -66,3 +66,9 @@ def connect_by_resection(
             both = (sorted((other, name), key=prepared.names.index) for other in placed)
             pairs += [PairSolution(a, b, "ok") for a, b in both]
     return prepared, reconstruction, pairs, reasons
+
+
+def listed(names: Iterable[str], most: int = 16) -> str:
+    """The first of very many, as a message has room for."""
+    every = list(names)
+    return ", ".join(every[:most]) + (f" and {len(every) - most} more" if len(every) > most else "")

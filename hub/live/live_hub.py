@@ -7,7 +7,7 @@ No sockets, threads, files or wall clock: ``handle`` takes messages, ``tick(now)
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,6 +15,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
+from hub.calibration.unconnected import listed
 from hub.clocks.observation_stream import LEAST_ROWS, ObservationStream
 from hub.distributed.network.host import NodeHost
 from hub.distributed.solver import node_calibration
@@ -226,11 +227,11 @@ class LiveHub:
         if len(ready) < 2 and self.stream.people.cameras:
             durations = {name: self.stream.people.seconds(name) for name in self.stream.people.cameras}
             if sum(seconds >= _MIN_PEOPLE_S for seconds in durations.values()) < 2:
-                counts = _listed(f"{name} {seconds:.0f} s" for name, seconds in durations.items())
+                counts = listed(f"{name} {seconds:.0f} s" for name, seconds in durations.items())
                 return f"people observed too briefly yet ({counts}; two cameras need {_MIN_PEOPLE_S:.0f} s): walk about"
             return ""
         if len(ready) < 2:
-            counts = _listed(f"{name} {rows}" for name, rows in rows_by_camera.items())
+            counts = listed(f"{name} {rows}" for name, rows in rows_by_camera.items())
             what = self.guidance.instruction()
             return f"too few detections yet ({counts}; two cameras need {self.settings.least_rows}): {what}"
         return ""
@@ -319,10 +320,10 @@ class LiveHub:
         never = [] if self.calibration is None else [name for name in self.calibration.cameras if name not in ages]
         silent = [f"{name} ({age:.0f} s)" for name, age in ages.items() if age > SILENT_S]
         silent += [f"{name} (never)" for name in never]
-        out += [f"no frames from {_listed(silent)}"] if silent else []
+        out += [f"no frames from {listed(silent)}"] if silent else []
         exceeding = self.budgets.exceeded(now, _BUDGET_NOTICE_S)
         if exceeding:
-            out.append(f"frames left out of {_listed(exceeding)}: more than a camera may send")
+            out.append(f"frames left out of {listed(exceeding)}: more than a camera may send")
         if self._schedule.left_out:
             out.append(f"{self._schedule.left_out} is left out: the solver failed with its rows")
         out += [*self.links.notices.values()][:8]
@@ -602,12 +603,6 @@ class LiveHub:
         source = self._source()
         boots = {name: self._solved_boot_ids.get(name) or source.boot(name) for name in calibration.cameras}
         return self.stream.clocks.to_present(calibration, boots)
-
-
-def _listed(names: Iterable[str], most: int = 16) -> str:
-    """The first of very many, as a message has room for."""
-    every = list(names)
-    return ", ".join(every[:most]) + (f" and {len(every) - most} more" if len(every) > most else "")
 
 
 def without_camera(rig: Rig, observations: Observations, camera: str) -> tuple[Rig, Observations]:
