@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtri
 
 from hub.bundle.bordered_system import solve
+from hub.bundle.noise.noise_scale import estimate_noise
 from hub.bundle.normal_equations import assemble, weigh_residuals
 from hub.bundle.problem import (
     ASPECT,
@@ -41,7 +41,6 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import AdjustmentStep
 
 _OUTLIER_SIGMA = 5.0  # rows beyond this many sigma are rejected as outliers
-_MIN_SIGMA_PX = 0.05  # px
 _COARSE_TOLERANCE, _FINE_TOLERANCE = 1e-4, 1e-7  # relative decrease of the cost that ends a round, and the last one
 
 
@@ -66,7 +65,7 @@ def adjust(
         last = round_index == rounds - 1
         max_iterations = iterations if last else max(4, iterations // 3)
         state = _minimise(problem, state, prior, robust, max_iterations, _COARSE_TOLERANCE, steps, coarse)
-        state = replace(state, sigma=estimate_noise(problem, state))
+        state = replace(state, sigma=estimate_noise(problem, state, prior))
         prior = estimate_smoothness(problem, state)
         if round_index >= rounds - 2:
             problem = mark_inliers(problem, state)
@@ -75,49 +74,8 @@ def adjust(
             progress(f"adjustment {round_index + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
     if not coarse:
         state = _minimise(problem, state, prior, robust, iterations, _FINE_TOLERANCE, steps, coarse)
-        state = replace(state, sigma=estimate_noise(problem, state))
+        state = replace(state, sigma=estimate_noise(problem, state, prior))
     return problem, replace(state, steps=tuple(steps)), prior
-
-
-def estimate_noise(problem: Problem, state: AdjustmentState) -> Floats:
-    """Robust noise (cameras,) of one pixel coordinate from the median residual.
-
-    Each separate point absorbs three of the few coordinates that observe it. There all cameras share one noise:
-    separate estimates would attribute all of it to one camera.
-    """
-    sigma = state.sigma.copy()
-    if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
-        return np.full(len(sigma), _pooled_noise(problem, state))
-    by_camera: dict[int, list[Floats]] = {}
-    for rows in problem.rows:
-        norms = residual_norms(rows, state.cameras[rows.camera], state.trajectories[rows.label])
-        by_camera.setdefault(rows.camera, []).append(norms[rows.use])
-    for camera, parts in by_camera.items():
-        values = np.concatenate(parts)
-        values = values[np.isfinite(values)]
-        if len(values) >= 8:
-            sigma[camera] = max(_MIN_SIGMA_PX, float(np.median(values)) / 1.1774)
-    return sigma
-
-
-def _pooled_noise(problem: Problem, state: AdjustmentState) -> float:
-    """Noise from the squared residuals of each point over the median of chi-squared at its redundancy.
-
-    A point that two cameras see leaves one degree of freedom: its residuals are half-normal, not Rayleigh.
-    """
-    ratios = []
-    for label, path in enumerate(state.trajectories):
-        squares, rows_of = np.zeros(path.basis.size), np.zeros(path.basis.size)
-        for rows in problem.rows:
-            if rows.label == label:
-                norms = residual_norms(rows, state.cameras[rows.camera], path)
-                good = rows.use & np.isfinite(norms)
-                index = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[good]))[0]
-                squares += np.bincount(index, norms[good] ** 2, path.basis.size)
-                rows_of += np.bincount(index, minlength=path.basis.size)
-        seen = rows_of >= 2
-        ratios.append(squares[seen] / chdtri(2.0 * rows_of[seen] - 3.0, 0.5))
-    return max(_MIN_SIGMA_PX, float(np.sqrt(np.median(np.concatenate(ratios)))))
 
 
 def mark_inliers(problem: Problem, state: AdjustmentState) -> Problem:

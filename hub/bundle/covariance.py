@@ -107,7 +107,7 @@ def covariance(
         if exact is not None:
             constraints = np.concatenate([constraints, exact[:, columns]])
     _, free = constrained_step(information, np.zeros(len(columns)), constraints, np.zeros(len(constraints)))
-    return Covariance(columns, len(state.cameras), free, parts.a_inv_b, _inverse_blocks(system.band))
+    return Covariance(columns, len(state.cameras), free, parts.a_inv_b, inverse_blocks(system.band))
 
 
 def constrained_step(
@@ -323,7 +323,7 @@ def equivalent_std(axes: Floats) -> Floats:
     return np.asarray(high)
 
 
-def _inverse_blocks(band: Floats) -> Floats:
+def inverse_blocks(band: Floats) -> Floats:
     """Blocks (k, 24, 24) of the inverse of a banded matrix about its diagonal, by block recursion.
 
     Block i covers rows 12 i … 12 i + 23: every 12 neighbouring rows lie in one of them.

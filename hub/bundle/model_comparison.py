@@ -16,13 +16,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from hub.bundle.adjustment import apply_step, estimate_noise, gauge
+from hub.bundle.adjustment import apply_step, gauge
 from hub.bundle.block_matrix import BlockSum, ParameterCovariance
 from hub.bundle.bordered_system import BorderedSystem, Elimination, border_block, eliminate
 from hub.bundle.covariance import constrained_step
 from hub.bundle.noise.correlated_noise import MIN_INFLATION, lens_tolerance
 from hub.bundle.noise.gauss_markov import estimate_correlated_noise
-from hub.bundle.noise.noise_scale import correlation_inflation, modelled_inflation, score_inflation
+from hub.bundle.noise.noise_scale import correlation_inflation, modelled_inflation, residual_std, score_inflation
 from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
@@ -315,7 +315,7 @@ def _with_its_noise(
         corrected = replace(corrected, correlated_noise=estimate_correlated_noise(left, corrected))
         modelled = [modelled_inflation(left, corrected, one) for one in range(len(state.cameras))]
         inflation = np.maximum(inflation, modelled)
-    sigma = state.sigma * estimate_noise(left, corrected) / estimate_noise(problem, state) * np.sqrt(inflation)
+    sigma = state.sigma * residual_std(left, corrected) / residual_std(problem, state) * np.sqrt(inflation)
     step, _, _ = _Linearised.of(problem, state, sigma).best_step(camera, times)
     effective = 2.0 * sum(int(part.use.sum()) for part in problem.rows if part.camera == camera) / inflation[camera]
     return replace(step, statistic=float(effective * np.log1p(step.statistic / effective)))

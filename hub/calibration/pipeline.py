@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hub.bundle.adjustment import adjust, estimate_noise
+from hub.bundle.adjustment import adjust
 from hub.bundle.initialisation import (
     Reconstruction,
     place_cameras,
     reconstruct_incrementally,
     reconstruct_with_known_poses,
 )
+from hub.bundle.noise.noise_scale import residual_std
 from hub.bundle.noise.timestamp_jitter import estimate_frame_times
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
@@ -394,7 +395,7 @@ def solve_paper(
         free_parameters = replace(reconstruction.problem.free_parameters, clock=False)
         reconstruction.problem = replace(reconstruction.problem, free_parameters=free_parameters)
     reconstruction.state = replace(
-        reconstruction.state, sigma=estimate_noise(reconstruction.problem, reconstruction.state)
+        reconstruction.state, sigma=residual_std(reconstruction.problem, reconstruction.state)
     )
     warning = "the paper's method has no adjustment: its stds assume independent noise and are too small"
     return Solution(

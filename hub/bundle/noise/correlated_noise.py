@@ -12,11 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.bundle.adjustment import estimate_noise
 from hub.bundle.covariance import CameraCovariance, relative_rotation_stds
 from hub.bundle.gls import GlsSolution, is_tractable, solve_gls
 from hub.bundle.noise.gauss_markov import estimate_correlated_noise
-from hub.bundle.noise.noise_scale import correlation_inflation
+from hub.bundle.noise.noise_scale import correlation_inflation, estimate_noise
 from hub.bundle.normal_equations import camera_priors
 from hub.bundle.problem import (
     ASPECT,
@@ -98,7 +97,8 @@ def refit_with_correlated_noise(
         return problem, state
     if not (np.isfinite(best.cost) and rotation_std <= _MAX_ROTATION_STD):
         return problem, state
-    refitted = replace(best.state, sigma=estimate_noise(found, best.state), correlated_noise=noise_model)
+    prior = estimate_smoothness(found, best.state)
+    refitted = replace(best.state, sigma=estimate_noise(found, best.state, prior), correlated_noise=noise_model)
     step = AdjustmentStep("correlated noise", float(np.sqrt(np.mean(refitted.sigma**2))))
     return found, replace(refitted, steps=(*refitted.steps, step))
 

@@ -11,11 +11,21 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from scipy.special import chdtri
 
+from hub.bundle.block_matrix import DenseCovariance
 from hub.bundle.bordered_system import BAND
-from hub.bundle.covariance import Covariance, covariance
-from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, AdjustmentState, Problem, TrackObservations
-from hub.bundle.residuals import linearise, predict
+from hub.bundle.covariance import Covariance, covariance, inverse_blocks
+from hub.bundle.normal_equations import build_system
+from hub.bundle.problem import (
+    CAMERA_PARAMETERS,
+    OFFSET,
+    AdjustmentState,
+    FreeParameters,
+    Problem,
+    TrackObservations,
+)
+from hub.bundle.residuals import linearise, predict, residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT
@@ -23,8 +33,12 @@ from protocols.geometry.types import Floats
 
 _MAX_ROWS = 2000
 """Most rows of a camera over which the trace of the hat matrix is taken, evenly spaced."""
-_MIN_REDUNDANCY = 0.2
-"""Smallest redundancy of a camera: share of its residuals not absorbed by the fit."""
+_MAX_ROWS_IN_ROUNDS = 200
+"""The same while the adjustment goes on: gives the redundancy to a few percent."""
+_COMMON_DEGREES = 8.0
+"""Degrees of freedom of the noise that all cameras have in common, as the prior of each: where its own residuals have
+fewer, they determine the variance worse than to half of itself."""
+_MIN_SIGMA_PX = 0.05  # px: residuals of 0, in simulated data, would have infinite weight
 _MAX_LAG_S = 2.0
 """Largest lag [s] of the autocorrelation of residuals."""
 _MAX_INFLATION = 1000.0  # rows per effective row: a bound
@@ -34,51 +48,128 @@ _SIGNIFICANCE_SIGMA = 3.0
 """Sigma by which a correlation must exceed 0 to count."""
 
 
+def estimate_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> Floats:
+    """Robust noise (cameras,) of one pixel coordinate: residuals over their redundancy (Förstner 1979).
+
+    A path that follows the camera with the smallest residuals makes them smaller still: taken for its noise, they would
+    end at 0. Of camera parameters, each counts for one coordinate.
+    """
+    noise = residual_std(problem, state)
+    if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
+        return noise
+    fixed = replace(
+        problem, free_parameters=FreeParameters(pose=False, clock=False), lens_priors=(), lens_tolerances=()
+    )
+    system, _ = build_system(fixed, state, prior, robust=False)
+    found = Covariance(
+        np.zeros(0, dtype=np.int64),
+        len(state.cameras),
+        DenseCovariance(np.zeros((0, 0))),
+        system.border,
+        inverse_blocks(system.band),
+    )
+    parameters = np.bincount(problem.free_columns() // CAMERA_PARAMETERS, minlength=len(noise))
+    return _over_redundancy(noise, fixed, state, found, parameters, _MAX_ROWS_IN_ROUNDS)
+
+
 def rescale_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> AdjustmentState:
     """The state with ``sigma`` (cameras,) scaled for use in covariances; nothing else changes.
 
-    Separate points (a shared clock) have their own correction (`adjustment.estimate_noise`) and stay unchanged.
+    Separate points (a shared clock) have their own correction (`residual_std`) and stay unchanged.
     """
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return state
-    found = covariance(problem, state, prior)
-    fitted_parameters, inflation = np.zeros(len(state.cameras)), np.ones(len(state.cameras))
-    residual_count = np.zeros(len(state.cameras))
+    found, none = covariance(problem, state, prior), np.zeros(len(state.cameras))
+    noise = _over_redundancy(residual_std(problem, state), problem, state, found, none, _MAX_ROWS)
+    modelled = [modelled_inflation(problem, state, camera) for camera in range(len(state.cameras))]
+    return replace(state, sigma=noise * np.sqrt(np.maximum(correlation_inflation(problem, state), modelled)))
+
+
+def _over_redundancy(
+    noise: Floats, problem: Problem, state: AdjustmentState, found: Covariance, absorbed: Floats, most_rows: int
+) -> Floats:
+    """Noise (cameras,) of residual stds, given how many coordinates of each camera are absorbed beside those found."""
+    coordinates, absorbed = np.zeros(len(noise)), absorbed.astype(np.float64)
     for rows in problem.rows:
-        residual_count[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
-        fitted_parameters[rows.camera] += _hat_matrix_trace(problem, state, found, rows)
-    observed = correlation_inflation(problem, state)
-    for camera in range(len(state.cameras)):
-        inflation[camera] = max(observed[camera], modelled_inflation(problem, state, camera))
-    redundancy = np.maximum(1.0 - fitted_parameters / np.maximum(residual_count, 1.0), _MIN_REDUNDANCY)
-    return replace(state, sigma=state.sigma * np.sqrt(inflation / redundancy))
+        coordinates[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
+        absorbed[rows.camera] += _hat_matrix_trace(problem, state, found, rows, most_rows)
+    degrees = np.maximum(coordinates - absorbed, 1.0)
+    squares = np.square(noise) * np.maximum(coordinates, 1.0)
+    common = float(squares.sum() / degrees.sum())
+    return np.maximum(np.sqrt((squares + _COMMON_DEGREES * common) / (degrees + _COMMON_DEGREES)), _MIN_SIGMA_PX)
 
 
-def _hat_matrix_trace(problem: Problem, state: AdjustmentState, found: Covariance, rows: TrackObservations) -> float:
+def residual_std(problem: Problem, state: AdjustmentState) -> Floats:
+    """Robust std (cameras,) of one coordinate of the residuals, from their median.
+
+    Each separate point absorbs three of the few coordinates that observe it. There all cameras share one noise:
+    separate estimates would attribute all of it to one camera.
+    """
+    sigma = state.sigma.copy()
+    if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
+        return np.full(len(sigma), _pooled_noise(problem, state))
+    by_camera: dict[int, list[Floats]] = {}
+    for rows in problem.rows:
+        norms = residual_norms(rows, state.cameras[rows.camera], state.trajectories[rows.label])
+        by_camera.setdefault(rows.camera, []).append(norms[rows.use])
+    for camera, parts in by_camera.items():
+        values = np.concatenate(parts)
+        values = values[np.isfinite(values)]
+        if len(values) >= 8:
+            sigma[camera] = max(_MIN_SIGMA_PX, float(np.median(values)) / 1.1774)
+    return sigma
+
+
+def _pooled_noise(problem: Problem, state: AdjustmentState) -> float:
+    """Noise from the squared residuals of each point over the median of chi-squared at its redundancy.
+
+    A point that two cameras see leaves one degree of freedom: its residuals are half-normal, not Rayleigh.
+    """
+    ratios = []
+    for label, path in enumerate(state.trajectories):
+        squares, rows_of = np.zeros(path.basis.size), np.zeros(path.basis.size)
+        for rows in problem.rows:
+            if rows.label == label:
+                norms = residual_norms(rows, state.cameras[rows.camera], path)
+                good = rows.use & np.isfinite(norms)
+                index = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[good]))[0]
+                squares += np.bincount(index, norms[good] ** 2, path.basis.size)
+                rows_of += np.bincount(index, minlength=path.basis.size)
+        seen = rows_of >= 2
+        ratios.append(squares[seen] / chdtri(2.0 * rows_of[seen] - 3.0, 0.5))
+    return max(_MIN_SIGMA_PX, float(np.sqrt(np.median(np.concatenate(ratios)))))
+
+
+def _hat_matrix_trace(
+    problem: Problem, state: AdjustmentState, found: Covariance, rows: TrackObservations, most_rows: int = _MAX_ROWS
+) -> float:
     """Trace of the hat matrix over the rows: how many of their residual coordinates the fit absorbs."""
     used = np.flatnonzero(rows.use)
     if not len(used):
         return 0.0
-    pick = used[np.unique(np.linspace(0, len(used) - 1, min(len(used), _MAX_ROWS)).astype(np.int64))]
+    pick = used[np.unique(np.linspace(0, len(used) - 1, min(len(used), most_rows)).astype(np.int64))]
     use = np.zeros_like(rows.use)
     use[pick] = True
-    line = linearise(rows.using(use), state.cameras[rows.camera], state.trajectories[rows.label], CAMERA_PARAMETERS)
+    rows = rows.using(use)
+    line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label], CAMERA_PARAMETERS)
+    root = (np.where(line.valid, 1.0 / rows.used_relative_std, 0.0) / float(state.sigma[rows.camera]))[:, None, None]
+    by_point, by_camera = root * line.point_jacobian, root * line.camera_jacobian
     rows_of_label, columns, by_cameras = found.a_inv_b.parts[rows.label]
     first = rows_of_label.start + 3 * line.index
     inside = (first % BAND)[:, None] + np.arange(BAND)
     blocks = found.blocks[(first // BAND)[:, None, None], inside[:, :, None], inside[:, None, :]]
     w, n = line.weights, len(line.index)
     point = np.einsum("na,naibj,nb->nij", w, blocks.reshape(n, SUPPORT, 3, SUPPORT, 3), w, optimize=True)
-    trace = float(np.einsum("npi,nij,npj->", line.point_jacobian, point, line.point_jacobian, optimize=True))
+    trace = float(np.einsum("npi,nij,npj->", by_point, point, by_point, optimize=True))
     if len(found.columns):
         sensitivity = by_cameras[3 * line.index[:, None] + np.arange(BAND)].reshape(n, SUPPORT, 3, len(columns))
-        shift = -line.point_jacobian @ np.einsum("na,naip->nip", w, sensitivity)
+        shift = -by_point @ np.einsum("na,naip->nip", w, sensitivity)
         parameters = problem.free_columns()[columns]
         own = np.flatnonzero(parameters // CAMERA_PARAMETERS == rows.camera)
-        shift[:, :, own] += line.camera_jacobian[:, :, parameters[own] % CAMERA_PARAMETERS]
+        shift[:, :, own] += by_camera[:, :, parameters[own] % CAMERA_PARAMETERS]
         free = found.free.submatrix(columns)
         trace += float(np.einsum("npi,ij,npj->", shift, free, shift, optimize=True))
-    return trace / float(state.sigma[rows.camera]) ** 2 * len(used) / len(pick)
+    return trace * len(used) / len(pick)
 
 
 def modelled_inflation(problem: Problem, state: AdjustmentState, camera: int) -> float:

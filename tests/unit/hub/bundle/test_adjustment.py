@@ -11,7 +11,7 @@ from scipy.linalg import null_space
 from hub.bundle.adjustment import adjust, apply_step, gauge
 from hub.bundle.block_matrix import BlockSum, SparseCovariance
 from hub.bundle.bordered_system import BAND, BorderedSystem, PathByCameras, border_block, eliminate, solve
-from hub.bundle.covariance import _inverse_blocks, constrained_step
+from hub.bundle.covariance import constrained_step, inverse_blocks
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
     ASPECT,
@@ -272,12 +272,12 @@ def test_without_free_cameras_only_the_path_moves() -> None:
     assert build_system(fixed, apply_step(fixed, state, path, cameras), prior, robust=False)[1] < before
 
 
-def test_inverse_blocks_equal_those_of_the_dense_inverse() -> None:
+def testinverse_blocks_equal_those_of_the_dense_inverse() -> None:
     problem, state, prior = simulated_problem(7)
     system, _ = build_system(problem, state, prior, robust=False)
     size = system.band.shape[1]
     inverse = np.linalg.inv(dense(system)[:size, :size])
-    blocks = _inverse_blocks(system.band)
+    blocks = inverse_blocks(system.band)
     padded = np.zeros((BAND * (len(blocks) + 1),) * 2)
     padded[:size, :size] = inverse
     for i, block in enumerate(blocks):
@@ -290,9 +290,9 @@ def test_inverse_blocks_equal_those_of_the_dense_inverse() -> None:
 def test_a_path_past_a_cameras_centre_leaves_the_stds_and_steps_of_others_as_they_are() -> None:
     problem, state, prior = simulated_problem(7)
     system, _ = build_system(problem, state, prior, robust=False)
-    before, step = _inverse_blocks(system.band), solve(system, 0.0, gauge(problem, state))[0]
+    before, step = inverse_blocks(system.band), solve(system, 0.0, gauge(problem, state))[0]
     system.band[-1, -1] = 1e25 * system.band[-1].max()
-    after, held = _inverse_blocks(system.band), solve(system, 0.0, gauge(problem, state))[0]
+    after, held = inverse_blocks(system.band), solve(system, 0.0, gauge(problem, state))[0]
     np.testing.assert_allclose(after[0, :BAND, :BAND], before[0, :BAND, :BAND], rtol=0.1)
     assert np.linalg.norm(held[:BAND]) > 0.1 * np.linalg.norm(step[:BAND])
 
