@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from hub.bundle.bordered_system import solve
-from hub.bundle.noise.noise_scale import estimate_noise
+from hub.bundle.noise.noise_scale import estimate_noise, residual_std
 from hub.bundle.normal_equations import assemble, weigh_residuals
 from hub.bundle.problem import (
     ASPECT,
@@ -65,7 +65,8 @@ def adjust(
         last = round_index == rounds - 1
         max_iterations = iterations if last else max(4, iterations // 3)
         state = _minimise(problem, state, prior, robust, max_iterations, _COARSE_TOLERANCE, steps, coarse)
-        state = replace(state, sigma=estimate_noise(problem, state, prior))
+        noise = residual_std(problem, state) if coarse else estimate_noise(problem, state, prior)
+        state = replace(state, sigma=noise)
         prior = estimate_smoothness(problem, state)
         if round_index >= rounds - 2:
             problem = mark_inliers(problem, state)

@@ -119,8 +119,9 @@ class BlockTridiagonal:
             factor, info = dpotrf(pivot)
             if info:
                 raise np.linalg.LinAlgError(f"block {i} of a matrix is not positive definite")
-            inverse = np.triu(dpotri(factor)[0])
-            pivots[i] = inverse + np.triu(inverse, 1).T
+            inverse = dpotri(factor)[0]  # its upper triangle
+            pivots[i] = inverse + inverse.T
+            pivots[i].flat[:: len(block) + 1] *= 0.5
         return cls(pivots, above)
 
     def solve(self, right: Floats) -> Floats:
