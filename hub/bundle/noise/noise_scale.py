@@ -68,7 +68,7 @@ def estimate_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPr
         system.border,
         inverse_blocks(system.band),
     )
-    parameters = np.bincount(problem.free_columns() // CAMERA_PARAMETERS, minlength=len(noise))
+    parameters = np.bincount(problem.free_columns() // CAMERA_PARAMETERS, minlength=len(noise)).astype(np.float64)
     return _over_redundancy(noise, fixed, state, found, parameters, _MAX_ROWS_IN_ROUNDS)
 
 
@@ -89,7 +89,7 @@ def _over_redundancy(
     noise: Floats, problem: Problem, state: AdjustmentState, found: Covariance, absorbed: Floats, most_rows: int
 ) -> Floats:
     """Noise (cameras,) of residual stds, given how many coordinates of each camera are absorbed beside those found."""
-    coordinates, absorbed = np.zeros(len(noise)), absorbed.astype(np.float64)
+    coordinates, absorbed = np.zeros(len(noise)), absorbed.copy()
     for rows in problem.rows:
         coordinates[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
         absorbed[rows.camera] += _hat_matrix_trace(problem, state, found, rows, most_rows)

@@ -9,9 +9,11 @@ import pytest
 
 from hub.bundle.adjustment import adjust
 from hub.bundle.covariance import covariance
-from hub.bundle.noise.noise_scale import _hat_matrix_trace, _serial_inflation, rescale_noise
+from hub.bundle.noise.noise_scale import _hat_matrix_trace, _serial_inflation, rescale_noise, residual_std
 from hub.bundle.normal_equations import build_system
+from hub.calibration.pipeline import calibrate
 from protocols.geometry.types import Floats
+from tests.support.rigs import simulate
 from tests.unit.hub.bundle.test_adjustment import dense, simulated_problem
 
 
@@ -33,10 +35,20 @@ def test_the_noise_of_simulated_cameras_is_recovered() -> None:
     for seed in range(8):
         problem, state, _ = simulated_problem(seed)
         problem, state, prior = adjust(problem, state)
-        raw.append(state.sigma)
-        corrected.append(rescale_noise(problem, state, prior).sigma)
-    assert np.mean(corrected) == pytest.approx(0.5, rel=0.03)
+        raw.append(residual_std(problem, state))
+        corrected += [state.sigma, rescale_noise(problem, state, prior).sigma]
+    assert np.mean(corrected[::2]) == pytest.approx(0.5, rel=0.03)
+    assert np.mean(corrected[1::2]) == pytest.approx(0.5, rel=0.03)
     assert np.mean(raw) < 0.97 * np.mean(corrected)
+
+
+@pytest.mark.parametrize(("fps", "seed"), [((10.0, 30.0, 60.0), 29), ((6.0, 15.0, 50.0), 26), ((6.0, 15.0, 50.0), 28)])
+def test_a_path_that_could_follow_one_camera_does_not_make_its_noise_vanish(fps: tuple[float, ...], seed: int) -> None:
+    """The path of the fastest camera can pass through all rows of a slow one, whose noise then seemed 0.01 px."""
+    session = simulate(seed, 4, 30.0, noise=1.5, fps=fps, fastest=1.5)
+    found = calibrate(session.rig, session.observations())
+    residuals = np.array([camera.rms_px for camera in found.cameras.values()])
+    assert residuals.min() > 0.5 * residuals.max()
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])
