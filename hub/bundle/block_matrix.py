@@ -111,14 +111,21 @@ class BlockTridiagonal:
     above: Floats
 
     @classmethod
-    def of(cls, diagonal: Floats, above: Floats) -> BlockTridiagonal:
-        """Of blocks (k, b, b) on the diagonal and above it. Raises LinAlgError if it is not positive definite."""
+    def of(cls, diagonal: Floats, above: Floats, definite: bool = True) -> BlockTridiagonal:
+        """Of blocks (k, b, b) on the diagonal and above it.
+
+        definite: whether it has to be positive definite, else LinAlgError is raised; rounding may leave a matrix that
+        is semidefinite, as of a path where nobody observes it, slightly below.
+        """
         pivots = np.empty_like(diagonal)
         for i, block in enumerate(diagonal):
             pivot = block - above[i - 1].T @ pivots[i - 1] @ above[i - 1] if i else block
             factor, info = dpotrf(pivot)
-            if info:
+            if info and definite:
                 raise np.linalg.LinAlgError(f"block {i} of a matrix is not positive definite")
+            if info:
+                pivots[i] = np.linalg.inv(pivot)
+                continue
             inverse = dpotri(factor)[0]  # its upper triangle
             pivots[i] = inverse + inverse.T
             pivots[i].flat[:: len(block) + 1] *= 0.5

@@ -141,7 +141,10 @@ def _constrained_inverse(normal: BlockSum, directions: Floats) -> ParameterCovar
     last = max(len(held) - CAMERA_PARAMETERS, 0)
     held = np.unique([held[first : first + CAMERA_PARAMETERS] for first in (0, last // 2, last)])
     weight[np.setdiff1d(np.arange(normal.size), held)] = 0.0
-    factored = (normal + BlockSum(weight)).factored()
+    try:
+        factored = (normal + BlockSum(weight)).factored()
+    except np.linalg.LinAlgError:  # some parameter is hardly determined: pivots of the whole matrix are safer
+        factored = None
     if factored is None:
         if not len(directions):
             return DenseCovariance(np.asarray(np.linalg.inv(normal.dense()), dtype=np.float64))
@@ -342,4 +345,4 @@ def inverse_blocks(band: Floats) -> Floats:
         above[row[~same] // BAND, row[~same] % BAND, column[~same] % BAND] = values[~same]
     on_diagonal = np.einsum("kii->ki", diagonal)
     on_diagonal += regularisation(on_diagonal.ravel()).reshape(on_diagonal.shape)
-    return BlockTridiagonal.of(diagonal, above).inverse_blocks()
+    return BlockTridiagonal.of(diagonal, above, definite=False).inverse_blocks()
