@@ -12,7 +12,7 @@ from hub.bundle.datum.control_outliers import reject_outliers, reject_refuted
 from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
 from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state, with_exact_poses
 from hub.bundle.datum.held_gauge import similarity_to_published
-from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation_times, seen_by_two
+from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation_times, seen_by_two, sigma_limit
 from hub.bundle.model_comparison import REFUTED_SIGMA
 from hub.bundle.noise.noise_scale import rescale_noise
 from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
@@ -165,7 +165,8 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         + _estimated_readouts(cameras)
         + _estimated_jitter(names, state, time_scales)
         + _clock_step_warnings(cameras)
-        + _wrong_detector_stds(cameras),
+        + _wrong_detector_stds(cameras)
+        + _large_residuals(names, state),
         residuals={
             name: _residual_rows(problem, state, i, time_origins[i], time_scales[i]) for i, name in enumerate(names)
         },
@@ -302,6 +303,19 @@ def _clock_step_warnings(cameras: dict[str, CameraCalibration]) -> tuple[str, ..
         f"{'before' if time > camera.lag_time else 'after'} the step, and the rows on the other side were corrected"
         for name, camera in cameras.items()
         for time, size, std in camera.clock_steps
+    )
+
+
+def _large_residuals(names: list[str], state: AdjustmentState) -> tuple[str, ...]:
+    """One sentence for each camera whose residuals are no noise, though no test told what they are."""
+    if len(names) < 3:
+        return ()
+    return tuple(
+        f"{name}: its residuals ({state.sigma[i]:.2g} px a coordinate) are {3.0 * state.sigma[i] / limit:.1f} times "
+        "the others': its lens, its detections or its times are not what they are said to be, and its pose may be further "
+        "off than its std"
+        for i, name in enumerate(names)
+        if state.sigma[i] > (limit := sigma_limit(state, i))
     )
 
 

@@ -413,6 +413,19 @@ def test_the_stds_that_a_detector_states_are_checked_against_its_residuals(facto
     assert warned == ([] if factor == 1.0 else ["cam1"])
 
 
+def test_a_camera_whose_residuals_are_far_larger_than_the_others_is_named() -> None:
+    """Detections that wander by some pixels: no lens and no clock explains them, and no test of one tells."""
+    session = rigs.simulate(2, 4, 20.0, noise=0.5)
+    mine = of(session, "cam3")
+    wander = 3.0 * np.sin(np.add.outer(2.0 * np.pi * session.time[mine] / 1.3, [0.0, 1.0]))
+    session.pixels[mine] += wander
+    found = calibrate(session.rig, session.observations())
+    named = [text.split(":")[0] for text in found.warnings if "times the others'" in text]
+    assert named == ["cam3"]
+    session.pixels[mine] -= wander
+    assert not any("times the others'" in text for text in calibrate(session.rig, session.observations()).warnings)
+
+
 def test_of_two_references_that_explain_a_contradiction_alike_neither_is_blamed() -> None:
     """The reference of cam1 is 8 std off; noise makes cam2's the likelier of the two, by a factor of 80."""
     session, rng = rigs.simulate(3, 4, 20.0), np.random.default_rng(3)
