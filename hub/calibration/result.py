@@ -312,8 +312,8 @@ def _large_residuals(names: list[str], state: AdjustmentState) -> tuple[str, ...
         return ()
     return tuple(
         f"{name}: its residuals ({state.sigma[i]:.2g} px a coordinate) are {3.0 * state.sigma[i] / limit:.1f} times "
-        "the others': its lens, its detections or its times are not what they are said to be, and its pose may be further "
-        "off than its std"
+        "the others': its lens, its detections or its times are not what they are said to be, and its pose may be "
+        "further off than its std"
         for i, name in enumerate(names)
         if state.sigma[i] > (limit := sigma_limit(state, i))
     )
