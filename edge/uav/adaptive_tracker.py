@@ -144,8 +144,7 @@ class AdaptiveTracker:
 
     def _without_ground(self, image: Image | None, time: float) -> Estimate:
         seen = self._appearance.handle_frame(image, time)
-        ready = image is not None and time > self._retry_at and self._appearance.certain
-        if ready and image is not None:
+        if image is not None and time > self._retry_at and self._appearance.certain:
             self._retry_at, self._retry_s = np.inf, 2.0 * self._retry_s
             self._restart_ground(image, time, seen)
         return self._on_image(seen)

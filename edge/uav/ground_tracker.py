@@ -183,11 +183,8 @@ class GroundTracker:
         if len(others) and main_weight < 0.97:
             # Particles outside the main cluster are searched in groups, another group each frame.
             centre = self._rng.choice(others)
-            in_group = (
-                np.square(particles.position[others] - particles.position[centre]).sum(axis=1)
-                < (1.5 * target.length) ** 2
-            )
-            for found in self._search(image, others[in_group], wide=False):
+            squared = np.square(particles.position[others] - particles.position[centre]).sum(axis=1)
+            for found in self._search(image, others[squared < (1.5 * target.length) ** 2], wide=False):
                 if all(np.linalg.norm(found.ground - c.ground) > 0.4 * target.length for c in candidates):
                     candidates.append(found)
         if target.aligned and candidates and not any(target.appearance.shape_matches(found) for found in candidates):
@@ -197,11 +194,8 @@ class GroundTracker:
             if all(np.linalg.norm(found.ground - c.ground) > min_distance for c in candidates):
                 candidates.append(found)
         # While the motion is unknown, the tolerance covers wherever the target can have moved since its last detection.
-        slack = (
-            0.0
-            if target.aligned
-            else (0.2 if self._fit is None else 0.1) * target.length * (1 + min(self._missed_frames, _MAX_SLACK_FRAMES))
-        )
+        growth = 0.0 if target.aligned else 0.2 if self._fit is None else 0.1
+        slack = growth * target.length * (1 + min(self._missed_frames, _MAX_SLACK_FRAMES))
         reacquiring = self._missed_frames > _REACQUIRE_AFTER
         tracklets = self._tracklets.update(self._time, candidates)
         if reacquiring and share > 0.5:
@@ -238,13 +232,12 @@ class GroundTracker:
                 continue
             speed = float(np.hypot(*motion[0]))
             reach = 2.0 * self._target.length + 0.6 * fit.speed * (self._time - self._last_seen)
-            distance = float(np.hypot(*(particles.position - tracklet.positions[-1]).T).min())
+            away = np.hypot(*(particles.position - tracklet.positions[-1]).T)
+            distance = float(away.min())
             if not 0.4 * fit.speed < speed < 1.6 * fit.speed or distance > reach:
                 continue
             # In the direction of the particles there, or at least not back where the target came from.
-            headings = particles.heading[
-                np.hypot(*(particles.position - tracklet.positions[-1]).T) < distance + self._target.length
-            ]
+            headings = particles.heading[away < distance + self._target.length]
             course = np.arctan2(motion[0][1], motion[0][0])
             if np.cos(headings - course).max() < 0.7:
                 continue
@@ -301,12 +294,8 @@ class GroundTracker:
         fit, target = self._fit, self._target
         if fit is None or not target.aligned or self._localiser.frames_without_pose:
             return []
-        lost_for = self._time - self._last_seen
-        weight = (
-            _LOST_INJECTED_WEIGHT
-            if self._state is TrackState.LOST
-            else min(_INJECTION_RATE * lost_for, _MAX_INJECTED_WEIGHT)
-        )
+        weight = min(_INJECTION_RATE * (self._time - self._last_seen), _MAX_INJECTED_WEIGHT)
+        weight = _LOST_INJECTED_WEIGHT if self._state is TrackState.LOST else weight
         out = []
         for blob, found, plausibility in self._redetector.detect(
             image, working, self._localiser, target, fit, self._time
@@ -332,11 +321,8 @@ class GroundTracker:
         out = np.zeros(len(pixels))
         if not inside.any() or self._localiser.frames_without_pose or not self._road.has_colour_model:
             return np.where(inside & (self._localiser.frames_without_pose == 0), _DETECTION_PROBABILITIES[0], 0.0)
-        half_length = (
-            _END_OFFSET
-            * self._target.length
-            * np.column_stack([np.cos(particles.heading), np.sin(particles.heading)])[inside]
-        )
+        axis = np.column_stack([np.cos(particles.heading), np.sin(particles.heading)])[inside]
+        half_length = _END_OFFSET * self._target.length * axis
         positions = particles.position[inside]
         points = np.concatenate([positions, positions - half_length, positions + half_length])
         last_pixel = np.array([working.shape[1] - 1, working.shape[0] - 1])
@@ -356,7 +342,8 @@ class GroundTracker:
                 self._particles, best.ground, target.position_std(best.visible_share), self._rng
             )
             if target.aligned and target.appearance.shape_matches(best):
-                self._particles = particle_set.reset_heading(self._particles, best.angle, _HEADING_STD, self._rng)
+                heading = best.angle + self._rng.normal(0.0, _HEADING_STD, len(self._particles))
+                self._particles = replace(self._particles, heading=heading)
         if reacquiring:
             self._history.restart(*self._particles.mean_velocity())
         self._missed_frames, self._detected_frames = 0, self._detected_frames + 1
@@ -391,12 +378,13 @@ class GroundTracker:
                 self._road.reset()
                 self._relearn_road = True
         elif self._detected_frames > 3:
-            if measurement.posterior > 0.9 and best.visible_share > 0.98:
+            sure, complete = measurement.posterior > 0.9, best.visible_share > 0.98
+            if sure and complete:
                 target.update_typical_score(best.score)
-            if measurement.posterior > 0.9 and not measurement.ambiguous:
+            if sure and not measurement.ambiguous:
                 target.update_local_gain(image, best)
-            if self._frame % 4 == 0 and _is_unambiguous(measurement):
-                target.update_appearance(image, best)
+                if self._frame % 4 == 0 and complete and best.score > 0.75:
+                    target.update_appearance(image, best)
 
     def _handle_miss(self, dt: float) -> None:
         """Predict: without a detection the particles move on, along the road paths."""
@@ -438,9 +426,8 @@ class GroundTracker:
 
     def _change_ground_frame(self, estimate: Estimate) -> None:
         """Change to another ground frame where telemetry now gives a better one."""
-        box = Box(
-            estimate.x - 0.5 * estimate.width, estimate.y - 0.5 * estimate.height, estimate.width, estimate.height
-        )
+        width, height = estimate.width, estimate.height
+        box = Box(estimate.x - 0.5 * width, estimate.y - 0.5 * height, width, height)
         frame = self._localiser.better_frame(self._time, box)
         if frame is None:
             return
@@ -468,24 +455,9 @@ class GroundTracker:
             self._particles, self._target, self._localiser, self._missed_frames, time, self._time - self._last_seen
         )
         self._state = found.state
-        return replace(found, layers=self._layers())
-
-    def _layers(self) -> LazyLayers:
         localiser, road, position = self._localiser, self._road, self._particles.weights @ self._particles.position
         paths = self._occlusion.paths if self._occlusion is not None else []
         named = {f"path {k}": partial(localiser.pixels, path.points) for k, path in enumerate(paths)}
-        return LazyLayers(
-            {
-                "tracks": lambda: localiser.tracks,
-                "road": lambda: localiser.pixels(road.road_cells(position, _ROAD_OVERLAY_REACH)),
-                **named,
-            }
-        )
-
-
-def _is_unambiguous(measurement: MeasurementLikelihood) -> bool:
-    """Whether a detection is certain, complete, unique and of typical score, so that the appearance may adapt to it."""
-    best = measurement.best
-    if best is None or measurement.ambiguous:
-        return False
-    return measurement.posterior > 0.9 and best.score > 0.75 and best.visible_share > 0.98
+        cells = partial(road.road_cells, position, _ROAD_OVERLAY_REACH)
+        drawn = LazyLayers({"tracks": lambda: localiser.tracks, "road": lambda: localiser.pixels(cells()), **named})
+        return replace(found, layers=drawn)

@@ -1,7 +1,7 @@
 """Any target in any view: cars, boats, bicycles and people in oblique video, also while the camera looks away.
 
     python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique]
-        [--first-seed 0] [--ranges 1,2.5,4] [--light dusk] [--stabilisation] [--json]
+        [--first-seed 0] [--ranges 1,2.5,4] [--screens 0] [--light dusk] [--stabilisation] [--json]
 
 Rendered oblique flights with truth, and where the data folder has them real ones: whole sequences, and windows that pan
 away from the target for 0.5 to 4 s and come back. No lens, no telemetry.
@@ -113,12 +113,20 @@ def run(sequence: Sequence, model: str) -> Score:
 
 
 def flight(
-    target: str, path: str, seed: int, rate: float, away_s: float, frames: int | None = None, range_factor: float = 1.0
+    target: str,
+    path: str,
+    seed: int,
+    rate: float,
+    away_s: float,
+    frames: int | None = None,
+    range_factor: float = 1.0,
+    screens: int = 0,
 ) -> Sequence:
-    """One rendered flight as a sequence."""
+    """One rendered flight as a sequence; see ``ObliqueWorld``."""
     seconds = 2.5 + 1.2 + away_s + 2.5 if path == "away" else 8.0
     count = round(seconds * rate) if frames is None else frames
-    world = ObliqueWorld(target, path, seed, fps=rate, frames=count, away_s=away_s, range_factor=range_factor)
+    far = range_factor
+    world = ObliqueWorld(target, path, seed, (640, 360), rate, count, away_s, range_factor=far, screens=screens)
     pairs = [world.rendered(i) for i in range(count)]
     box = np.array([(t.box.x, t.box.y, t.box.width, t.box.height) for _, t in pairs])
     visible = np.array([t.visible for _, t in pairs])
@@ -128,14 +136,14 @@ def flight(
     return Sequence(f"{target} {path} {seed}", kind, images, box[first:], rate, visible[first:])
 
 
-def rendered(seeds: range, ranges: list[float], kinds: list[str]) -> Iterator[Sequence]:
+def rendered(seeds: range, ranges: list[float], kinds: list[str], screens: int = 0) -> Iterator[Sequence]:
     """Rendered flights: every target, every flight, at 10 to 30 frames a second, the factors of the range in turn."""
     paths = [path for path in FLIGHTS if not kinds or ("rendered away" if path == "away" else "rendered") in kinds]
     for seed in seeds:
         for k, target in enumerate(TARGETS):
             for path in paths:
                 rate, away_s, factor = (of[(seed + k) % len(of)] for of in (_RATES, AWAY_S, ranges))
-                sequence = flight(target, path, 10 * seed + k, rate, away_s, range_factor=factor)
+                sequence = flight(target, path, 10 * seed + k, rate, away_s, None, factor, screens)
                 # One that is behind a house all the time cannot be marked: its first box shows the house.
                 if sequence.box[0, 2:].min() >= _LEAST_PX and sequence.visible[0] >= 0.99:
                     yield sequence
@@ -223,6 +231,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="rendered flights of each kind")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--ranges", default="1", help="of rendered flights, over the usual range: 4 makes a car 12 px")
+    parser.add_argument("--screens", type=int, default=0, help="trees and poles before the target, rendered flights")
     parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
     parser.add_argument("--light", default="", help="change the images: dusk, haze, flicker")
     parser.add_argument("--stabilisation", action="store_true", help="only: how well the real videos are stabilised")
@@ -241,7 +250,7 @@ def main() -> None:
     sources: list[Iterator[Sequence]] = []
     if not kinds or any(kind.startswith("rendered") for kind in kinds):
         seeds = range(options.first_seed, options.first_seed + options.seeds)
-        sources.append(rendered(seeds, [float(factor) for factor in options.ranges.split(",")], kinds))
+        sources.append(rendered(seeds, [float(factor) for factor in options.ranges.split(",")], kinds, options.screens))
     if not kinds or any(not kind.startswith("rendered") for kind in kinds):
         sources.append(real(options.data, not kinds or any("away" in kind for kind in kinds)))
     light = options.light

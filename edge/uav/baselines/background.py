@@ -63,30 +63,15 @@ def predicted_flow(motions: Floats, points: Floats) -> Floats:
     return np.stack([motions[:, :1] - motions[:, 2:] * y[None], motions[:, 1:2] + motions[:, 2:] * x[None]], axis=-1)
 
 
-class MotionModel:
-    """States (h_x, h_y, h_w): px, px, rad a frame."""
-
-    def propagate(self, states: Floats, rng: np.random.Generator) -> Floats:
-        """Eqs. (4.10) to (4.12): random walks. Deviation: heavy-tailed noise, a share of the steps is small."""
-        step_scale = np.where(rng.random(len(states)) < _SMALL_STEP_SHARE, _SMALL_STEP_SCALE, 1.0)
-        return np.asarray(
-            states + step_scale[:, None] * _PROCESS_NOISE_STD * rng.standard_normal(states.shape), dtype=np.float64
-        )
-
-    def log_likelihood(self, states: Floats, observation: OpticalFlow) -> Floats:
-        """Second eq. (4.18): exp(-lambda mean ||V - V(h)||), the norm capped for robustness to other cars."""
-        residual = predicted_flow(states, observation.points) - observation.vectors
-        distance = np.sqrt(np.square(residual).sum(axis=-1))
-        return np.asarray(-_SHARPNESS * np.minimum(distance, _MAX_RESIDUAL).mean(axis=1), dtype=np.float64)
-
-
 class BackgroundFilter:
-    """The motion of the background from frame to frame. size: (width, height) [px]."""
+    """The motion of the background from frame to frame. size: (width, height) [px].
+
+    It is its particles' model, too: states (h_x, h_y, h_w) in px, px, rad a frame.
+    """
 
     def __init__(self, size: tuple[int, int], rng: np.random.Generator) -> None:
         self._size, self._rng = size, rng
         self._centre = (np.array(size, dtype=np.float64) - 1.0) / 2.0
-        self._model = MotionModel()
         self._particles = pf.Particles.uniform(rng.standard_normal((_PARTICLES, 3)) * _INITIAL_STD)
         self._grey: Grey = np.zeros((size[1], size[0]), dtype=np.uint8)
         self._corners = np.zeros((0, 2), dtype=np.float32)
@@ -104,14 +89,25 @@ class BackgroundFilter:
         before = self._corners[good].astype(np.float64) - self._centre
         self.flow = OpticalFlow(before, tracked[good].astype(np.float64) - self._corners[good])
         enough = len(before) >= _MIN_FLOWS
-        self._particles = pf.step(
-            self._particles, self._model, self.flow if enough else None, self._rng, resample_below=1.0
-        )
+        self._particles = pf.step(self._particles, self, self.flow if enough else None, self._rng, resample_below=1.0)
         h = pf.weighted_mean(self._particles.states, self._particles.weights)
         self._grey, self._corners = grey, self._inside(tracked[good], target)
         if len(self._corners) < _MIN_CORNERS:
             self._corners = self._detect_corners(grey, target)
         return BackgroundMotion(float(h[0]), float(h[1]), float(h[2]))
+
+    def propagate(self, states: Floats, rng: np.random.Generator) -> Floats:
+        """Eqs. (4.10) to (4.12): random walks. Deviation: heavy-tailed noise, a share of the steps is small."""
+        step_scale = np.where(rng.random(len(states)) < _SMALL_STEP_SHARE, _SMALL_STEP_SCALE, 1.0)
+        return np.asarray(
+            states + step_scale[:, None] * _PROCESS_NOISE_STD * rng.standard_normal(states.shape), dtype=np.float64
+        )
+
+    def log_likelihood(self, states: Floats, observation: OpticalFlow) -> Floats:
+        """Second eq. (4.18): exp(-lambda mean ||V - V(h)||), the norm capped for robustness to other cars."""
+        residual = predicted_flow(states, observation.points) - observation.vectors
+        distance = np.sqrt(np.square(residual).sum(axis=-1))
+        return np.asarray(-_SHARPNESS * np.minimum(distance, _MAX_RESIDUAL).mean(axis=1), dtype=np.float64)
 
     def _track(self, grey: Grey) -> tuple[npt.NDArray[np.float32], Bools]:
         """Pyramidal Kanade-Lucas-Tomasi tracking: current positions of the corners (m, 2), and which were found."""

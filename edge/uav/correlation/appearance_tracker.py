@@ -12,9 +12,10 @@ from copy import copy
 
 import numpy as np
 
-from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Image, TrackState
 from edge.uav.correlation.belief import Belief
 from edge.uav.correlation.candidate import Kinematics
+from edge.uav.correlation.colour import ColourModel
 from edge.uav.correlation.filter import CorrelationFilter, Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -33,6 +34,7 @@ _SIZE_INSIDE = 0.85  # and above which the flow in it measures its size
 _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
+_COLOUR_SHARE = 0.5  # of its log likelihood ratio that the similarity and the filter, which see it too, do not have
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
 _MOVED = 2.0  # distance within which what moves is looked for, in target lengths
 _SLIP_STD = 0.35  # of a box that has slipped off its target, in target lengths: the two still overlap
@@ -81,10 +83,11 @@ class AppearanceTracker:
         self._scale.learn(image, self.box)
         self._flow.remember(image, self.box)
         self._memory.add(image, self.box)
+        self._colour = ColourModel(image, self.box)
         self._observe_background(image, self.box)
         self._shape = Outline(image, self.box)
         self._missed, self._unseen_s = 0, 0.0
-        self._redetection = Redetection(self._size, self._memory, self._respond)
+        self._redetection = Redetection(self._size, self._memory, self._respond, self._colour)
         self._ratio, self._learn_above = 0.0, _LEARN_ABOVE
         self._expected: Estimate | None = None
         self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
@@ -94,9 +97,6 @@ class AppearanceTracker:
         self._searching = False
         self._parts = MovingParts(image, self._time, self.box)
         return self._estimate(time)
-
-    def handle_telemetry(self, sample: Telemetry) -> None:
-        """Unused."""
 
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
         """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
@@ -108,9 +108,9 @@ class AppearanceTracker:
             self._belief.add(0.0, dt)
             self._miss(dt)
             return self._estimate(time)
-        self.motion = self._scene.update(image, self._outline() if self._missed == 0 else None)
+        place, half = self.box.centre, 0.6 * self.box.extent
+        self.motion = self._scene.update(image, np.append(place - half, place + half) if self._missed == 0 else None)
         image = self._scene.photometric.corrected(image)
-        place = self.box.centre
         origin = self._predict(dt)
         self._parts.update(image, self._time, self.box, self.motion, place, origin)
         if not self._searching:
@@ -237,10 +237,11 @@ class AppearanceTracker:
             self._observe_rivals(image, box)
 
     def _measured(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, float, float]:
-        """The target about a box: where, its similarity, and the log likelihood ratio by that and by the filter."""
+        """The target about a box: where, its similarity, and the log likelihood ratio by that, filter and colour."""
         box, answer = self._respond(image, box)
         score = self._memory.score(image, box)
-        return box, score, self._memory.tracking_ratio(score) + answer.log_ratio
+        colour = _COLOUR_SHARE * self._colour.log_ratio(image, box)
+        return box, score, self._memory.tracking_ratio(score) + answer.log_ratio + colour
 
     def _accept(self, image: Image, box: OrientedBox, score: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
@@ -283,6 +284,7 @@ class AppearanceTracker:
         else:
             self._scale.learn(image, box)
         self._memory.confirm(score)
+        self._colour.learn(image, box)
         if self._frame % _OBSERVE_EVERY == 0:
             self._memory.add(image, box)
 
@@ -318,13 +320,15 @@ class AppearanceTracker:
     def _observe_places(self, image: Image, box: OrientedBox, where: OrientedBox, reach: Floats) -> list[float]:
         """Scores of the best places within ``reach`` of a box, off the target."""
         found = search(image, self._memory, where, reach, 8)
-        away = [f.score for f in found if np.abs(box.axes.T @ (f.box.centre - box.centre) / box.sides).max() > 0.7]
+        off = [f for f in found if np.abs(box.axes.T @ (f.box.centre - box.centre) / box.sides).max() > 0.7]
+        away = [f.score for f in off]
+        self._colour.observe(image, [f.box for f in off])
         self._memory.observe_background(np.array(away), float(np.prod(1.0 + 2.0 * reach / box.sides)))
         return away
 
     def _miss(self, dt: float) -> None:
         if self._missed == 0:
-            self._redetection = Redetection(self._size, self._memory, self._respond)
+            self._redetection = Redetection(self._size, self._memory, self._respond, self._colour)
             # What it was lost to has moved it since the evidence was last clear.
             box, velocity = self._sure
             if velocity.std < _SURE_STD * self.length:
@@ -351,11 +355,6 @@ class AppearanceTracker:
         # That of the other tracker, where its place was followed: their geometric mean, for it knows the plane only.
         std = float(np.sqrt(self.std * min(self._other_std, self.std)))
         return Prediction(self.box, std, motion, self._missed, self._unseen_s)
-
-    def _outline(self) -> Floats:
-        """x0, y0, x1, y1 about the target [px]."""
-        half = 0.6 * self.box.extent
-        return np.concatenate([self.box.centre - half, self.box.centre + half])
 
     def _estimate(self, time: float) -> Estimate:
         state = TrackState.VISIBLE if self._missed == 0 else TrackState.COASTING

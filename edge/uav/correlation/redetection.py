@@ -9,6 +9,7 @@ import numpy as np
 
 from edge.uav.base import Image
 from edge.uav.correlation.candidate import KEEPS, MAX_TESTS, Candidate, Kinematics
+from edge.uav.correlation.colour import ColourModel
 from edge.uav.correlation.filter import Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -59,10 +60,11 @@ class Prediction:
 class Redetection:
     """One absence. size: of the images [px]; localise: the box and the answer of the target's filter about a box."""
 
-    def __init__(self, size: tuple[int, int], memory: TemplateMemory, localise: Localise) -> None:
+    def __init__(self, size: tuple[int, int], memory: TemplateMemory, localise: Localise, colour: ColourModel) -> None:
         self._size, self._memory, self._localise = size, memory, localise
         # Probabilities that it is near the prediction, that it is in the image, and that it was not seen there.
         self._near, self._inside, self._unnoticed = 1.0, 0.0, 1.0
+        self._colour = colour
         self._tested: list[Candidate] = []
         self._moving = UNKNOWN
 
@@ -119,7 +121,9 @@ class Redetection:
             return
         priors = [self._log_prior(f.box.centre, expected) for f in new]
         odds = [
-            self._memory.log_ratio(f.score, _CHANGE, self._moving.log_ratio(f.box.centre)) + prior
+            self._memory.log_ratio(f.score, _CHANGE, self._moving.log_ratio(f.box.centre))
+            + prior
+            + self._colour.log_ratio(image, f.box)
             for f, prior in zip(new, priors, strict=True)
         ]
         order = np.argsort(odds)[::-1]
@@ -164,7 +168,7 @@ class Redetection:
         scores = self._memory.scores(image, trials)
         score, box = float(scores.max()), trials[int(scores.argmax())]
         cues = answer.log_ratio + self._moving.log_ratio(box.centre)
-        candidate.add(box, self._memory.log_ratio(score, _CHANGE, cues), dt)
+        candidate.add(box, self._memory.log_ratio(score, _CHANGE, cues) + self._colour.log_ratio(image, box), dt)
         return candidate.promising and box.share_inside(self._size) > _MIN_INSIDE
 
 

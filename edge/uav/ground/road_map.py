@@ -65,11 +65,8 @@ class RoadMap:
 
     def transfer_from(self, other: RoadMap, new_from_old: Floats) -> None:
         """Take over another map in another ground frame. new_from_old: (3, 3) homography of the ground."""
-        self._road_histogram, self._image_histogram, self._log_ratio_table = (
-            other._road_histogram,
-            other._image_histogram,
-            other._log_ratio_table,
-        )
+        self._road_histogram, self._image_histogram = other._road_histogram, other._image_histogram
+        self._log_ratio_table = other._log_ratio_table
         new = np.array(
             [[CELL, 0.0, self._origin[0] + 0.5 * CELL], [0.0, CELL, self._origin[1] + 0.5 * CELL], [0, 0, 1]]
         )

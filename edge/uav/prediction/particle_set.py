@@ -175,15 +175,9 @@ def propagate(
     decay = np.exp(-dt / (0.7 if visible else _ACCELERATION_TIME_CONSTANT_S))
     acceleration = particles.acceleration * decay
     speed_noise = 2.5 if visible else 0.8
-    cruise_acceleration = (
-        np.zeros(n)
-        if visible
-        else np.clip(
-            (particles.cruise_speed - particles.speed) / _CRUISE_TIME_CONSTANT_S,
-            -_MAX_CRUISE_ACCELERATION,
-            _MAX_CRUISE_ACCELERATION,
-        )
-    )
+    wanted = (particles.cruise_speed - particles.speed) / _CRUISE_TIME_CONSTANT_S
+    most = 0.0 if visible else _MAX_CRUISE_ACCELERATION
+    cruise_acceleration = np.clip(wanted, -most, most)
     speed = particles.speed + (acceleration + cruise_acceleration) * dt + speed_noise * sqrt_dt * rng.normal(size=n)
     speed = np.clip(speed, 0.0, _MAX_SPEED)
     free = particles.path == NO_PATH
@@ -283,13 +277,8 @@ def initialise_prediction(
     them a significant change of speed is assumed to last.
     """
     selected = particles.select(systematic_resample(particles.weights, count, rng))
-    significance = (
-        0.0
-        if paths_known
-        else float(
-            np.clip(abs(fit.longitudinal_acceleration) / max(fit.acceleration_std, 1e-6) - _MIN_SIGNIFICANCE, 0.0, 1.0)
-        )
-    )
+    excess = abs(fit.longitudinal_acceleration) / max(fit.acceleration_std, 1e-6) - _MIN_SIGNIFICANCE
+    significance = 0.0 if paths_known else float(np.clip(excess, 0.0, 1.0))
     sampled = sample_from_fit(
         fit, np.zeros(2), 0.0, count, rng, _ACCELERATION_PERSISTENCE + (1.0 - _ACCELERATION_PERSISTENCE) * significance
     )
@@ -337,11 +326,6 @@ def inject_particles(
     parts = ((getattr(particles, f.name), getattr(new, f.name)) for f in fields(ParticleSet))
     whole = ParticleSet(*(np.concatenate(pair) for pair in parts))
     return replace(whole, weights=whole.weights / whole.weights.sum())
-
-
-def reset_heading(particles: ParticleSet, heading: float, std: float, rng: np.random.Generator) -> ParticleSet:
-    """All headings set to one, with ``std`` [rad]."""
-    return replace(particles, heading=heading + rng.normal(0.0, std, len(particles)))
 
 
 def reinitialise_at(particles: ParticleSet, position: Floats, std: float, rng: np.random.Generator) -> ParticleSet:

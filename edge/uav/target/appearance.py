@@ -232,11 +232,8 @@ class AppearanceModel:
             _smooth_histogram(around / around.sum()),
         )
         if self._first_histogram is None or rate > 0.5:
-            self._first_histogram, self._target_histogram, self._background_histogram = (
-                target_sample,
-                target_sample,
-                background_sample,
-            )
+            self._first_histogram = self._target_histogram = target_sample
+            self._background_histogram = background_sample
         else:
             self._target_histogram = (1 - rate) * self._target_histogram + rate * target_sample
             self._background_histogram = (1 - 2 * rate) * self._background_histogram + 2 * rate * background_sample

@@ -116,11 +116,7 @@ FlightPlan = Callable[[float, Floats, Disturbance], Flight]
 
 
 def solve_exit(
-    rng: np.random.Generator,
-    motion: TargetMotion,
-    camera: CameraSetup,
-    frames: int,
-    plan: FlightPlan,
+    rng: np.random.Generator, motion: TargetMotion, camera: CameraSetup, frames: int, plan: FlightPlan
 ) -> tuple[Flight, tuple[int, int]]:
     """The flight with exactly ``frames`` consecutive frames in which no part of the target is in view, and these.
 
@@ -203,12 +199,7 @@ def yaw_exit(motion: TargetMotion, camera: CameraSetup, begin: float, angle: flo
     return plan
 
 
-def follow_target(
-    rng: np.random.Generator,
-    motion: TargetMotion,
-    camera: CameraSetup,
-    seconds: float,
-) -> Flight:
+def follow_target(rng: np.random.Generator, motion: TargetMotion, camera: CameraSetup, seconds: float) -> Flight:
     """A flight that keeps the target near the image centre."""
     times = grid_times(seconds)
     ground, _ = motion.at(times)

@@ -163,9 +163,15 @@ def building(rng: np.random.Generator) -> Body:
     return Body(tuple(parts))
 
 
-def tree(rng: np.random.Generator) -> Body:
-    """A trunk and a ragged crown."""
-    height, radius = rng.uniform(4, 9), rng.uniform(1.3, 3.0)
+def pole(rng: np.random.Generator) -> Body:
+    """A lamp post of 8 m."""
+    grey = int(rng.integers(60, 190))
+    return Body(((_flat([(-0.2, 0), (0.2, 0), (0.15, 8), (-0.15, 8)]), (grey, grey, grey)),), upright=True)
+
+
+def tree(rng: np.random.Generator, height: float | None = None) -> Body:
+    """A trunk and a ragged crown; height: of its middle [m]."""
+    height, radius = rng.uniform(4, 9) if height is None else height, rng.uniform(1.3, 3.0)
     parts: list[tuple[Floats, Colour]] = [(_flat([(-0.2, 0), (0.2, 0), (0.15, height), (-0.15, height)]), (50, 70, 90))]
     for _ in range(9):
         middle = rng.normal(0, 0.35 * radius), height + rng.normal(0, 0.3 * radius)

@@ -48,6 +48,7 @@ class ObliqueWorld:
 
     target: of ``TARGETS``; flight: of ``FLIGHTS``; frames: number; away_s: how long ``away`` looks elsewhere.
     quality: of the JPEG compression. range_factor: of the camera's distance; 5 makes a car some 12 px long.
+    screens: number of trees and poles that stand between the camera and the target's path. speed_factor: of its speed.
     """
 
     target: str
@@ -59,6 +60,8 @@ class ObliqueWorld:
     away_s: float = 2.0
     quality: int = 75
     range_factor: float = 1.0
+    screens: int = 0
+    speed_factor: float = 1.0
 
     def __post_init__(self) -> None:
         if self.target not in TARGETS or self.flight not in FLIGHTS:
@@ -73,7 +76,7 @@ class ObliqueWorld:
     def _path(self) -> tuple[Floats, Floats]:
         """Places (n, 2) and courses (n,) of the target."""
         rng = np.random.default_rng([self.seed, 1])
-        speed = _SPEEDS[self.target] * rng.uniform(0.7, 1.3)
+        speed = self.speed_factor * _SPEEDS[self.target] * rng.uniform(0.7, 1.3)
         rate = smoothed_noise(rng, self.frames, 1.0 / self.fps, 0.12, 2.0)
         course = rng.uniform(-np.pi, np.pi) + np.cumsum(rate) / self.fps
         step = speed / self.fps * np.column_stack([np.cos(course), np.sin(course)])
@@ -173,6 +176,20 @@ class ObliqueWorld:
                 continue
             body = bodies.building(rng) if tall else bodies.tree(rng)
             out.append((body, spot, float(rng.uniform(-np.pi, np.pi))))
+        return [*out, *self._screens()]
+
+    def _screens(self) -> list[tuple[Body, Floats, float]]:
+        """Trees and poles that the target passes behind, each at the height at which the line of sight meets it."""
+        rng = np.random.default_rng([self.seed, 8])
+        place, _ = self._path
+        _, centre, _ = self._camera
+        out: list[tuple[Body, Floats, float]] = []
+        for k in range(self.screens):
+            at = int(rng.integers(round(0.8 * self.fps), self.frames))
+            height = 3.0 if k % 3 == 2 else float(rng.uniform(4, 9))
+            body = bodies.pole(rng) if k % 3 == 2 else bodies.tree(rng, height)
+            share = height / centre[at, 2]
+            out.append((body, place[at] + share * (centre[at, :2] - place[at]), 0.0))
         return out
 
     @cached_property

@@ -13,6 +13,7 @@ from edge.uav.base import Basis, Box, Estimate, Image, TrackState
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.belief import Belief
 from edge.uav.correlation.candidate import Candidate, Kinematics
+from edge.uav.correlation.colour import ColourModel
 from edge.uav.correlation.filter import Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -82,7 +83,8 @@ def redetection() -> Redetection:
     def localise(image: Image, box: OrientedBox) -> tuple[OrientedBox, Response]:
         return box, Response(0.0, 0.0, 0.0, 1.0)
 
-    return Redetection(SIZE, TemplateMemory(), localise)
+    black = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    return Redetection(SIZE, TemplateMemory(), localise, ColourModel(black, OrientedBox(120.0, 120.0, 30.0, 20.0)))
 
 
 def test_a_target_beyond_the_border_is_not_ruled_out_by_what_the_image_shows() -> None:
@@ -216,7 +218,8 @@ def test_a_place_that_moves_under_test_looks_like_others_that_move(scene: Image)
     image, box = painted(scene, place), OrientedBox(*place, *map(float, TARGET))
     memory = TemplateMemory()
     memory.add(image, box)
-    search = Redetection(SIZE, memory, lambda image, box: (box, Response(0.0, 0.0, 0.0, 1.0)))
+    answer = Response(0.0, 0.0, 0.0, 1.0)
+    search = Redetection(SIZE, memory, lambda image, box: (box, answer), ColourModel(image, box))
     evidence = []
     for residual in (UNKNOWN, everywhere(20.0), everywhere(1.0)):
         search._moving = residual

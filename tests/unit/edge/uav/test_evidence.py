@@ -12,6 +12,7 @@ from edge.uav.correlation import redetection
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.belief import Belief
 from edge.uav.correlation.candidate import Candidate, Kinematics
+from edge.uav.correlation.colour import ColourModel
 from edge.uav.correlation.filter import CorrelationFilter, Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
@@ -181,8 +182,9 @@ def test_a_place_found_elsewhere_is_compared_with_the_predicted_one(
 
     monkeypatch.setattr(redetection, "search", search)
     monkeypatch.setattr(redetection.Redetection, "_test", lambda *_: True)
-    away = redetection.Redetection(SIZE, TemplateMemory(), lambda image, box: (box, Response(0.0, 0.0, 0.2, 1.0)))
-    box = OrientedBox(400.0, 300.0, *map(float, TARGET))
+    box, answer = OrientedBox(400.0, 300.0, *map(float, TARGET)), Response(0.0, 0.0, 0.2, 1.0)
+    colour = ColourModel(scene, box)
+    away = redetection.Redetection(SIZE, TemplateMemory(), lambda image, box: (box, answer), colour)
     still = Kinematics(np.zeros(2), 1.0, float(TARGET[0]))
     promising = Candidate(box.at(np.array([100.0, 100.0])), 4.0, still, hits=1)
     away._tested = [promising]
@@ -217,3 +219,17 @@ def test_a_box_that_is_hardly_in_the_image_is_not_learnt_as_the_whole_target() -
     tracker = adaptive_tracker.AdaptiveTracker(SIZE, fps=FPS)
     assert tracker._is_complete(Box(-2.0, 50.0, 40.0, 30.0))
     assert not tracker._is_complete(Box(-8.0, 50.0, 40.0, 30.0))
+
+
+def test_colour_tells_things_of_one_shape_apart_at_any_angle() -> None:
+    image = np.full((120, 200, 3), (70, 110, 120), np.uint8)
+    for x, colour in ((40, (130, 40, 130)), (100, (40, 130, 110)), (160, (130, 40, 130))):
+        cv2.rectangle(image, (x - 12, 54), (x + 12, 66), colour, -1)
+    own, other, like = (OrientedBox(x, 60.0, 25.0, 13.0) for x in (40.0, 100.0, 160.0))
+    model = ColourModel(image, own)
+    model.observe(image, [OrientedBox(x, 20.0, 25.0, 13.0) for x in (40.0, 100.0, 160.0)])
+    assert model.log_ratio(image, like) > 1.0
+    assert model.log_ratio(image, like.turned(0.4)) > 1.0
+    assert model.log_ratio(image, other) < -3.0
+    model.learn(image, own)
+    assert model.log_ratio(image, own) > 1.0
