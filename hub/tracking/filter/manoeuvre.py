@@ -101,17 +101,23 @@ def fused_predictions(
 
     past, future: predicted by ``elapsed`` forward and backward in time to the same moment.
     """
-    off = past.mean - future.mean
-    one = manoeuvre_hypothesis(past, elapsed[0], units_per_m, up)
-    two = manoeuvre_hypothesis(future, -elapsed[1], units_per_m, up)
-    smooth = kalman.log_density(off, past.covariance + future.covariance)
-    changed = kalman.log_density(off, one.covariance + two.covariance)
-    odds = one.prior_odds + two.prior_odds
+    fit, covariances, odds = continuation_hypotheses(past, future, elapsed, units_per_m, up)
     before, after = (
-        _mixed(state.covariance, replace(change, prior_odds=odds), smooth, changed)
-        for state, change in ((past, one), (future, two))
+        _mixed(smooth, ManoeuvreHypothesis(changed, odds), *fit) for smooth, changed in zip(*covariances, strict=True)
     )
     return kalman.fused(past.mean, before, future.mean, after)
+
+
+def continuation_hypotheses(
+    past: Targets, future: Targets, elapsed: tuple[float, float], units_per_m: float, up: Floats | None
+) -> tuple[Floats, tuple[tuple[Floats, Floats], tuple[Floats, Floats]], Floats]:
+    """Whether futures continue pasts, without and with a manoeuvre: log likelihoods (2, n), the covariances (n, 7, 7)
+    of past and future in both cases, and the prior odds (n,) of a manoeuvre. Arguments as in `fused_predictions`."""
+    one = manoeuvre_hypothesis(past, elapsed[0], units_per_m, up)
+    two = manoeuvre_hypothesis(future, -elapsed[1], units_per_m, up)
+    covariances = (past.covariance, future.covariance), (one.covariance, two.covariance)
+    fit = np.array([kalman.log_density(past.mean - future.mean, a + b) for a, b in covariances])
+    return fit, covariances, one.prior_odds + two.prior_odds
 
 
 def _mixed(covariance: Floats, hypothesis: ManoeuvreHypothesis, smooth: Floats, changed: Floats) -> Floats:
