@@ -194,11 +194,13 @@ class Regime:
     drops: float = 0.02
     outliers: float = 0.0
     fps: tuple[float, ...] = (30.0, 25.0, 29.97, 50.0)
+    fastest: float = 0.7
     references: bool = False
 
 
 REGIMES = (
     Regime("clean, 30 fps", drops=0.0, fps=(30.0,)),
+    Regime("6 to 60 fps, 1.5 px", 4, 30.0, 1.5, fps=(10.0, 30.0, 60.0, 6.0), fastest=1.5),
     Regime("mixed rates, 200 ppm"),
     Regime("two cameras", cameras=2),
     Regime("five cameras", cameras=5),
@@ -215,7 +217,15 @@ def scores(regime: int, seed: int) -> tuple[int, list[float], list[float], list[
     """z-scores of clocks, positions and path of one run; empty if refused."""
     r = REGIMES[regime]
     session = rigs.simulate(
-        seed, r.cameras, r.seconds, noise=r.noise, drops=r.drops, outliers=r.outliers, fps=r.fps, late=2.0
+        seed,
+        r.cameras,
+        r.seconds,
+        noise=r.noise,
+        drops=r.drops,
+        outliers=r.outliers,
+        fps=r.fps,
+        fastest=r.fastest,
+        late=2.0,
     )
     rig = session.rig
     if r.references:
