@@ -43,10 +43,13 @@ _MAX_SAMPLES = 4_000_000
 """Of one path: 4.6 hours at 240 Hz."""
 
 
-def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | None = None) -> Calibration:
+def assemble_calibration(
+    rig: Rig, solution: Solution, published: Calibration | None = None, refine_lenses: bool = False
+) -> Calibration:
     """The calibration in the rig's world frame and units, on the reference camera's clock.
 
     published: an earlier calibration of the same cameras, whose world and scale are kept where the rig fixes none.
+    refine_lenses: whether measured lenses were free to change.
     """
     reconstruction = solution.reconstruction
     # The rig's order decides which camera is the reference and the first baseline.
@@ -89,8 +92,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     scaled = rescale_noise(noisy, scaled, prior)
     covariance = cov.covariance(noisy, scaled, prior, gauge.information, datum_points, gauge.exact)
     effects = sensitivities(rig, names, noisy, scaled, prior, covariance)
-    lens_stds = focal_stds(problem, state, covariance)
-    readout_stds = np.sqrt(np.maximum(covariance.variances[:, READOUT], 0.0))
+    lens_stds, readout_stds = np.sqrt(np.maximum(covariance.variances[:, [FOCAL, READOUT]], 0.0)).T
     time_origins = [solution.prepared.time_origins[name] for name in names]
     time_scales = [solution.prepared.time_scale(name) for name in names]
     base = state.cameras[reference]
@@ -158,9 +160,8 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         + solution.warnings
         + control_outliers
         + gauge.warnings
-        + _estimated_lenses(cameras)
-        + _refined_lenses(names, problem, state)
-        + (refuted_lens_warnings(names, problem, state) if published is None else ())
+        + _estimated_lenses(rig, cameras)
+        + (refuted_lens_warnings(names, problem, state, refine_lenses) if published is None else ())
         + _other_frame_rates(rig, cameras, names[reference])
         + _estimated_readouts(cameras)
         + _estimated_jitter(names, state, time_scales)
@@ -225,34 +226,21 @@ def _reordered(problem: Problem, state: AdjustmentState, order: list[int]) -> tu
     )
 
 
-def focal_stds(problem: Problem, state: AdjustmentState, covariance: cov.Covariance | None = None) -> Floats:
-    """(cameras,) relative stds of estimated focal lengths; 0 where the lens was given."""
-    is_estimated = [bool(problem.lens_priors) and problem.lens_priors[i] is not None for i in range(len(state.cameras))]
-    if not any(is_estimated):
-        return np.zeros(len(is_estimated))
-    found = covariance or cov.covariance(problem, state, estimate_smoothness(problem, state))
-    return np.where(is_estimated, np.sqrt(np.maximum(found.variances[:, FOCAL], 0.0)), 0.0)
-
-
-def _estimated_lenses(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
-    """One sentence for each lens estimated by self-calibration."""
-    return tuple(
-        f"{name}: its lens was estimated from the trajectory: focal length {camera.intrinsics.focal:.1f} px ± "
-        f"{100 * camera.focal_std:.2g} % (std)"
-        for name, camera in cameras.items()
-        if camera.focal_std > 0.0
-    )
-
-
-def _refined_lenses(names: list[str], problem: Problem, state: AdjustmentState) -> tuple[str, ...]:
-    """One sentence for all given lenses that were refined within their tolerance."""
-    if not problem.lens_tolerances:
-        return ()
-    changes = ", ".join(
-        f"{name} {100 * (camera.intrinsics.focal / lens.focal - 1):+.1f} %"
-        for name, camera, lens in zip(names, state.cameras, problem.nominal, strict=True)
-    )
-    return (f"given lenses were refined within their tolerance: change of focal lengths {changes} (tolerance 1 %)",)
+def _estimated_lenses(rig: Rig, cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
+    """One sentence for each lens that was estimated: unknown, refined on request, or given with a std."""
+    out = []
+    for name, camera in cameras.items():
+        given, lens, std = rig.cameras[name], camera.intrinsics, f"{100 * camera.focal_std:.2g} % (std)"
+        if camera.focal_std > 0.0 and given.is_measured and given.intrinsics is not None:
+            before = given.intrinsics.focal
+            change = f"from {before:.1f} to {lens.focal:.1f} px ± {std}, by {100 * (lens.focal / before - 1):+.2g} %"
+            weight = f"; given ± {100 * given.focal_std:.2g} %" if given.focal_std else ""
+            if weight and abs(np.log(lens.focal / before)) > REFUTED_SIGMA * given.focal_std:
+                weight += ", which the observations refute"
+            out.append(f"{name}: its lens was refined: focal length {change}{weight}")
+        elif camera.focal_std > 0.0:
+            out.append(f"{name}: its lens was estimated from the trajectory: focal length {lens.focal:.1f} px ± {std}")
+    return tuple(out)
 
 
 def _other_frame_rates(rig: Rig, cameras: dict[str, CameraCalibration], reference: str) -> tuple[str, ...]:

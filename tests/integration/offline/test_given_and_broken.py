@@ -70,6 +70,32 @@ def test_a_wrong_lens_is_kept_and_named_and_right_ones_are_not(four: tuple[rigs.
 
 
 @pytest.mark.parametrize("solver", ["joint", "distributed"])
+def test_a_focal_length_with_a_std_is_an_observation_of_that_weight(solver: str) -> None:
+    session = rigs.simulate(3, 4, 30.0)
+    given = {name: replace(camera, focal_std=0.01) for name, camera in session.rig.cameras.items()}
+    wrong = replace(session, rig=replace(session.rig, cameras=given))
+    for name, factor in (("cam1", 1.012), ("cam2", 0.99)):
+        wrong = with_focal(wrong, name, factor)
+    found = calibrate(wrong.rig, wrong.observations(), solver=solver)
+    for name, camera in found.cameras.items():
+        lens = session.rig.cameras[name].intrinsics
+        assert lens is not None
+        assert abs(camera.intrinsics.focal / lens.focal - 1.0) < 4.0 * camera.focal_std < 0.02
+        assert np.array_equal(camera.intrinsics.distortions, lens.distortions)
+        assert [one.std for one in camera.sensitivities] == [0.01]
+        assert any(text.startswith(f"{name}: its lens was refined: focal length from") for text in found.warnings)
+
+
+def test_refined_lenses_are_told_with_their_stds(four: tuple[rigs.Session, Calibration]) -> None:
+    wrong = with_focal(four[0], "cam1", 1.012)
+    found = calibrate(wrong.rig, wrong.observations(), refine_lenses=True)
+    for name, camera in found.cameras.items():
+        told = f"{camera.intrinsics.focal:.1f} px ± {100 * camera.focal_std:.2g} % (std)"
+        assert any(text.startswith(f"{name}: its lens was refined") and told in text for text in found.warnings)
+        assert next(t.value for t in found.acceptance[name] if t.name == "std of the focal length") > 0.0
+
+
+@pytest.mark.parametrize("solver", ["joint", "distributed"])
 def test_separate_points_reach_the_optimum(solver: str) -> None:
     """Two of these 4,000 rows lie beyond four stds: they are noise, no outliers, and two points near an epipole."""
     rng = np.random.default_rng(0)
