@@ -10,7 +10,14 @@ import numpy as np
 from hub.bundle import covariance as cov
 from hub.bundle.datum.control_outliers import reject_outliers, reject_refuted
 from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
-from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state, with_exact_poses
+from hub.bundle.datum.gauge import (
+    at_control_points,
+    fix_gauge,
+    identity_gauge,
+    is_overdetermined,
+    transform_state,
+    with_exact_poses,
+)
 from hub.bundle.datum.held_gauge import similarity_to_published
 from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation_times, seen_by_two
 from hub.bundle.model_comparison import REFUTED_SIGMA
@@ -21,7 +28,7 @@ from hub.bundle.problem import CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
-from hub.calibration.pairs.pair_network import RATE_TOLERANCE, pair_lag
+from hub.calibration.pairs.pair_network import RATE_TOLERANCE, coincide, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
 from hub.calibration.solution import Solution
 from hub.sync.hypothesis import PairSolution
@@ -61,12 +68,14 @@ def assemble_calibration(
     datum_points: list[tuple[int, Floats]] = []
     if solution.known is None:
         rig, control_outliers = reject_outliers(rig, names, [camera.pose for camera in state.cameras])
-        if is_overdetermined(rig, names) and problem.free_parameters.pose:
+        poses = [camera.pose for camera in state.cameras]
+        if is_overdetermined(rig, names, poses) and problem.free_parameters.pose:
             prior = estimate_smoothness(problem, state)
-            network = cov.covariance(problem, rescale_noise(problem, state, prior), prior).of_each_camera(*range(6))
-            rig, refuted = reject_refuted(rig, names, [camera.pose for camera in state.cameras], network)
+            scaled = rescale_noise(problem, state, prior)
+            network = cov.covariance(problem, scaled, prior, longest=True).of_each_camera(*range(6))
+            rig, refuted = reject_refuted(rig, names, poses, network)
             control_outliers += refuted
-        gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
+        gauge = fix_gauge(rig, names, poses)
         gauge = scaled_by_bars(gauge, measure_scale_bars(rig, reconstruction.labels, problem, state))
         if published is not None and gauge.scale == "arbitrary":
             held, datum_points = similarity_to_published(
@@ -79,10 +88,11 @@ def assemble_calibration(
             gauge = replace(gauge, similarity=held)
         state = transform_state(state, gauge.similarity)
         adjustable = problem.free_parameters.pose and solution.solver != "paper"  # its method has no adjustment
-        if gauge.scale == "metric" and adjustable and is_overdetermined(rig, names):
+        if gauge.scale == "metric" and adjustable and is_overdetermined(rig, names, poses):
             prior = estimate_smoothness(problem, state)
             fitted = adjust_to_control_points(rig, names, problem, rescale_noise(problem, state, prior), prior)
             state = replace(fitted, sigma=state.sigma)
+            gauge = at_control_points(gauge, rig, names, [camera.pose for camera in state.cameras])
         if gauge.scale == "metric":
             state = with_exact_poses(rig, names, state)
     else:
@@ -416,13 +426,14 @@ def _pair_report(
     if pair.fundamental is None and a is not None and b is not None:
         middle = float(middles[names.index(pair.a), names.index(pair.b)])
         time_a, time_b = (_camera_clock(state, names, name, middle, solution) for name in (pair.a, pair.b))
-        relative = relative_pose_between(a.pose, b.pose)
+        matrices = a.intrinsics.matrix, b.intrinsics.matrix
+        in_one_place = coincide(a.pose.position, b.pose.position)  # then they have no epipolar geometry
         return PairReport(
             cameras=(pair.a, pair.b),
             status=pair.status,
             lag_s=time_a - time_b,
             clock_rate=b.time_map.clock_rate / a.time_map.clock_rate,
-            fundamental=fundamental_from(relative, a.intrinsics.matrix, b.intrinsics.matrix),
+            fundamental=None if in_one_place else fundamental_from(relative_pose_between(a.pose, b.pose), *matrices),
             inliers=None if fit is None else fit.inliers,
             rms_px=None if fit is None or not np.isfinite(fit.residual_px) else fit.residual_px,
             acceptance=pair.acceptance,

@@ -41,7 +41,7 @@ def rescale_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPri
     """
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return state
-    found = covariance(problem, state, prior)
+    found = covariance(problem, state, prior, longest=True)
     fitted_parameters, inflation = np.zeros(len(state.cameras)), np.ones(len(state.cameras))
     residual_count = np.zeros(len(state.cameras))
     for rows in problem.rows:

@@ -76,6 +76,7 @@ def test_contradicting_distances_are_refused(
     folder = write_session(tmp_path / "session", filmed, metadata)
     assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 3
     assert "contradict" in capsys.readouterr().err
+    assert run(["calibrate", str(folder), "--solver", "distributed", "--seed", "-1", "--out", str(tmp_path / "o")]) == 2
 
 
 def test_an_answer_with_distances_is_plain_toml_in_the_rigs_units(filmed: Session, tmp_path: Path) -> None:
