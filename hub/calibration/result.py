@@ -169,6 +169,7 @@ def assemble_calibration(
         warnings=solution.prepared.warnings
         + solution.warnings
         + control_outliers
+        + _unused_lengths(rig, names, reconstruction.labels)
         + gauge.warnings
         + _estimated_lenses(rig, cameras)
         + (refuted_lens_warnings(names, problem, state, refine_lenses) if published is None else ())
@@ -250,6 +251,17 @@ def _estimated_lenses(rig: Rig, cameras: dict[str, CameraCalibration]) -> tuple[
             out.append(f"{name}: its lens was refined: focal length {change}{weight}")
         elif camera.focal_std > 0.0:
             out.append(f"{name}: its lens was estimated from the trajectory: focal length {lens.focal:.1f} px ± {std}")
+    return tuple(out)
+
+
+def _unused_lengths(rig: Rig, names: list[str], labels: list[str]) -> tuple[str, ...]:
+    """One sentence for each distance and scale bar of which an end was not solved."""
+    out = []
+    for what, given, known in (("distance", rig.distances, names), ("scale bar (wand)", rig.scale_bars, labels)):
+        for a, b, _ in given:
+            missing = " and ".join(one for one in (a, b) if one not in known)
+            if missing:
+                out.append(f"the {what} {a}–{b} was not used: no solution has {missing}")
     return tuple(out)
 
 

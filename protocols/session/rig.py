@@ -32,6 +32,7 @@ MEASURED_FOCAL_STD = 0.02
 """A lens whose focal length has at most this relative std counts as measured, all but the focal length."""
 MAX_READOUT_S = 0.06
 """Upper bound [s] of a rolling shutter's readout, from an image's first row to its last."""
+_MAX_READOUT_INTERVALS = 1.25  # frame intervals: an answer's estimated readout is at most that, and is read again
 _MAX_POINTS = 20_000  # of all rigid bodies
 _POSITION_TOLERANCE = 1e-3  # relative: position and translation may differ by rounding, not by more
 
@@ -298,7 +299,7 @@ def _read_camera(table: _Table) -> RigCamera:
         focal_std=_read_focal_std(table),
         up=_read_up_of_camera(table),
         ball_outline=_read_ball_outline(table),
-        readout=_read_readout(table),
+        readout=_read_readout(table, float(fps)),
         table=dict(table.values),
     )
 
@@ -319,13 +320,16 @@ def _read_ball_outline(table: _Table) -> bool:
     return value
 
 
-def _read_readout(table: _Table) -> float | None:
+def _read_readout(table: _Table, fps: float) -> float | None:
     value = table.values.get("readout")
     if value is None:
         return None
     if not isinstance(value, int | float) or isinstance(value, bool) or not -MAX_READOUT_S <= value <= MAX_READOUT_S:
         remedy = "give the seconds from the image's first row to its last, as 0.02; below 0 if the last is read first"
         raise table.fail("readout", f"readout = {value!r}", remedy)
+    if fps > 0.0 and abs(value) > _MAX_READOUT_INTERVALS / fps:
+        longer = f"readout = {value!r} is longer than the {1e3 / fps:.3g} ms between two frames at fps = {fps:g}"
+        raise table.fail("readout", longer, "a sensor is read before its next frame: correct one of the two")
     return float(value)
 
 
