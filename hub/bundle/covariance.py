@@ -84,13 +84,15 @@ def covariance(
     control_information: BlockSum | None = None,
     datum_points: list[tuple[int, Floats]] | None = None,
     exact: Floats | None = None,
+    longest: bool = False,
 ) -> Covariance:
     """Covariance at the solution.
 
     control_information: (18 n, 18 n) information of control points: surveyed positions, attitudes and distances. Gauge
-    directions that they leave free are fixed by convention: the first camera's pose and the first baseline, or, with
+    directions that they leave free are fixed by convention (`gauge_constraints`), or, with
     datum_points (label index, internal times), by inner constraints over these points of the trajectories. exact:
-    (q, 18 n) directions in which nothing is uncertain, because control points without std fix them.
+    (q, 18 n) directions in which nothing is uncertain, because control points without std fix them. longest: see
+    `gauge_constraints`.
     """
     system, _ = build_system(problem, state, prior, robust=False)
     parts = eliminate(system)
@@ -103,7 +105,7 @@ def covariance(
         if datum_points:
             constraints = inner_constraints(parts.a_inv_b, state, datum_points)
         else:
-            constraints = gauge_constraints([camera.pose for camera in state.cameras], given)[:, columns]
+            constraints = gauge_constraints([camera.pose for camera in state.cameras], given, longest)[:, columns]
         if exact is not None:
             constraints = np.concatenate([constraints, exact[:, columns]])
     _, free = constrained_step(information, np.zeros(len(columns)), constraints, np.zeros(len(constraints)))
@@ -198,19 +200,23 @@ def gauge_generators(poses: list[Pose]) -> Floats:
     return np.concatenate(rows)
 
 
-def gauge_constraints(poses: list[Pose], control_information: BlockSum) -> Floats:
-    """Constraint rows (q, 18 n) that fix the gauge directions that the control points leave free."""
+def gauge_constraints(poses: list[Pose], control_information: BlockSum, longest: bool = False) -> Floats:
+    """Constraint rows (q, 18 n) that fix the gauge directions that the control points leave free.
+
+    They are the first camera's pose and the first baseline; where that is no convention, because control points give
+    the scale or any datum serves (``longest``), the first camera's longest baseline: one much shorter than the rig is
+    hardly known itself.
+    """
     generators = gauge_generators(poses)
+    scaled = generators / np.linalg.norm(generators, axis=0)  # to unit norm, so that one threshold serves all seven
+    values, vectors = np.linalg.eigh(scaled.T @ (control_information @ scaled))
+    baselines = np.array([pose.position - poses[0].position for pose in poses])
+    length = np.linalg.norm(baselines, axis=1)
+    second = int(np.argmax(length)) if longest or values[-1] > 0.0 else 1
     default = np.zeros((7, len(generators)))
     default[np.arange(6), np.arange(6)] = 1.0
-    baseline = poses[1].position - poses[0].position
-    baseline = baseline / np.linalg.norm(baseline)
-    default[6, 3:6] = -baseline
-    default[6, CAMERA_PARAMETERS + 3 : CAMERA_PARAMETERS + 6] = baseline
-    # Generators scaled to unit norm, so that one threshold serves all seven.
-    scaled = generators / np.linalg.norm(generators, axis=0)
-    prior_information = scaled.T @ (control_information @ scaled)
-    values, vectors = np.linalg.eigh(prior_information)
+    default[6, 3:6] = -baselines[second] / length[second]
+    default[6, CAMERA_PARAMETERS * second + 3 : CAMERA_PARAMETERS * second + 6] = baselines[second] / length[second]
     free_directions = vectors[:, values < 1e-6 * max(float(values[-1]), 1e-30)] if values[-1] > 0 else np.eye(7)
     return np.asarray(free_directions.T @ np.linalg.inv(default @ scaled) @ default)
 

@@ -50,9 +50,9 @@ _MAX_GAP = 1.0  # s: the trajectory is split where no camera saw the point for l
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraInput:
-    """Input of the reconstruction for one camera. tracks: by label. lens_prior: prior of a lens that was not measured.
-    readout_given: whether its readout was given, so that its times are already corrected. stated_std: the median of the
-    stds [px] that the detector states for its rows; 0 without any."""
+    """Input of the reconstruction for one camera. tracks: by label. lens_prior: prior of a lens that was not measured,
+    or whose focal length has a std. readout_given: whether its readout was given, so that its times are already
+    corrected. stated_std: the median of the stds [px] that the detector states for its rows; 0 without any."""
 
     name: str
     intrinsics: Intrinsics

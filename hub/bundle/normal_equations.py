@@ -155,6 +155,7 @@ def camera_priors(problem: Problem, state: AdjustmentState) -> list[tuple[int, f
         lens_prior = problem.lens_prior(camera)
         if lens_prior is not None:
             terms.append((FOCAL, float(np.log(current.intrinsics.focal / lens_prior.focal)), lens_prior.focal_std))
+        if lens_prior is not None and not lens_prior.focal_only:
             shift = current.intrinsics.matrix[:2, 2] - lens_prior.centre
             terms += [
                 (CENTRE, float(shift[0]), lens_prior.centre_std),
@@ -163,7 +164,7 @@ def camera_priors(problem: Problem, state: AdjustmentState) -> list[tuple[int, f
             terms.append((K1, float(current.intrinsics.distortions[0] - lens_prior.k1), lens_prior.k1_std))
             terms.append((K2, float(current.intrinsics.distortions[1] - lens_prior.k2), lens_prior.k2_std))
             terms += _further_lens_priors(current.intrinsics, nominal, lens_prior)
-        elif free_parameters.lens:
+        elif lens_prior is None and free_parameters.lens:
             terms.append((FOCAL, float(np.log(current.intrinsics.focal / nominal.focal)), free_parameters.focal_std))
             terms.append(
                 (K1, float(current.intrinsics.distortions[0] - nominal.distortions[0]), free_parameters.k1_std)

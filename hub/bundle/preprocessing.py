@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hub.bundle.initialisation import CameraInput
-from hub.bundle.problem import TrackObservations
+from hub.bundle.problem import LensPrior, TrackObservations
 from hub.trajectory.discrete import sampled_track
 from hub.trajectory.image_tracks import ImageTrack, SmoothTrack, smooth_track, without_clock_steps
 from protocols.geometry.camera import Intrinsics
@@ -103,7 +103,7 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
         if not tracks:
             refused[name] = "no observations"
             return
-        is_uncalibrated = rig_camera.intrinsics is None or rig_camera.focal_std > 0.0
+        is_uncalibrated = not rig_camera.is_measured
         if is_uncalibrated:
             refused[name] = NO_INTRINSICS
             if rig.shared_clock:
@@ -153,8 +153,14 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
             return
         time_origins[name] = time_origin
         rows[name] = mine
+        focal_std = 0.0 if is_uncalibrated else rig_camera.focal_std
         (uncalibrated if is_uncalibrated else cameras)[name] = CameraInput(
-            name, lens, smooth, readout_given=rig_camera.readout is not None, stated_std=_typical_std(tracks)
+            name,
+            lens,
+            smooth,
+            LensPrior(lens.focal, focal_std) if focal_std else None,
+            readout_given=rig_camera.readout is not None,
+            stated_std=_typical_std(tracks),
         )
 
     for name, rig_camera in rig.cameras.items():

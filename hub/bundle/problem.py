@@ -169,7 +169,7 @@ class AdjustmentState:
 
 @dataclass(frozen=True, slots=True)
 class LensPrior:
-    """Prior of a lens whose parameters are all estimated.
+    """Prior of a lens whose parameters are estimated: all, or, without the other stds, the focal length alone.
 
     focal: [px], focal_std: of its logarithm. centre: (u, v) of the principal point, centre_std: [px]. k1, k2: the
     first distortion coefficients, k1_std, k2_std: their stds; k3_std, tangential_std, aspect_std: of parameters with
@@ -178,15 +178,20 @@ class LensPrior:
 
     focal: float
     focal_std: float
-    centre: tuple[float, float]
-    centre_std: float
-    k1: float
-    k1_std: float
-    k2: float
-    k2_std: float
+    centre: tuple[float, float] = (0.0, 0.0)
+    centre_std: float = 0.0
+    k1: float = 0.0
+    k1_std: float = 0.0
+    k2: float = 0.0
+    k2_std: float = 0.0
     k3_std: float = 0.01
     tangential_std: float = 2e-3
     aspect_std: float = 2e-3
+
+    @property
+    def focal_only(self) -> bool:
+        """Whether the lens was measured, and its focal length has a std."""
+        return not self.k1_std
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,10 +218,11 @@ class Problem:
 
     rows: all observations. nominal: given intrinsics (prior means of the lens). clock_reference: index of the camera
     whose clock is the internal time. anchors: the two cameras whose pose and distance fix the gauge. lens_priors: by
-    camera, priors of lenses that were not measured, None = given; () = all are given. readout_given: by camera, whether
-    its readout was given, so that the rows' times are already corrected; () = none was. lens_tolerances: by camera,
-    priors for given lenses that are estimated all the same; () = they are fixed. crystal_rates: by camera, whether its
-    rate differs from the reference's only as two crystals do (`CRYSTAL_RATE_STD`); () = not decided.
+    camera, priors of lenses that were not measured or whose focal length has a std, None = given; () = all are given.
+    readout_given: by camera, whether its readout was given, so that the rows' times are already corrected; () = none
+    was. lens_tolerances: by camera, priors for given lenses that are estimated all the same; () = they are fixed.
+    crystal_rates: by camera, whether its rate differs from the reference's only as two crystals do
+    (`CRYSTAL_RATE_STD`); () = not decided.
     """
 
     rows: tuple[TrackObservations, ...]
@@ -244,9 +250,12 @@ class Problem:
         return min([MAX_READOUT_S, *(float(np.median(step)) for step in steps if len(step))])
 
     def lens_prior(self, camera: int) -> LensPrior | None:
-        """The prior of a lens whose parameters are all estimated; None = at most focal length and k1 are."""
+        """The prior of a lens that is estimated; None = at most focal length and k1 are."""
         prior = self.lens_priors[camera] if self.lens_priors else None
-        return self.lens_tolerances[camera] if prior is None and self.lens_tolerances else prior
+        if self.lens_tolerances and (prior is None or prior.focal_only):
+            tolerance = self.lens_tolerances[camera]
+            return replace(tolerance, focal_std=tolerance.focal_std if prior is None else prior.focal_std)
+        return prior
 
     def free_columns(self) -> Ints:
         """Indices of the free camera parameters in the stacked vector of CAMERA_PARAMETERS each."""
@@ -257,10 +266,11 @@ class Problem:
                 columns += range(base, base + 6)
             if self.free_parameters.clock and camera != self.clock_reference:
                 columns += [base + OFFSET, base + RATE]
-            if self.free_parameters.lens or self.lens_prior(camera) is not None:
-                columns += [base + FOCAL, base + K1]
+            prior = self.lens_prior(camera)
+            if self.free_parameters.lens or prior is not None:
+                columns += [base + FOCAL, base + K1][: 1 if prior is not None and prior.focal_only else 2]
             if self.is_readout_free(camera):
                 columns.append(base + READOUT)
-            if self.lens_prior(camera) is not None:
+            if prior is not None and not prior.focal_only:
                 columns += range(base + CENTRE, base + (P1 if self.nominal[camera].fisheye else CAMERA_PARAMETERS))
         return np.array(columns, dtype=np.int64)

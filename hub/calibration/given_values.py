@@ -30,11 +30,13 @@ def refuted_lens(test: ScoreTest) -> str:
     )
 
 
-def refuted_lens_warnings(names: list[str], problem: Problem, state: AdjustmentState) -> tuple[str, ...]:
+def refuted_lens_warnings(
+    names: list[str], problem: Problem, state: AdjustmentState, refine_lenses: bool = False
+) -> tuple[str, ...]:
     """One sentence for each measured lens that the observations refute; the answer keeps it as given."""
+    remedy = "correct it" if refine_lenses else "correct it, or estimate it with --refine-lenses"
     return tuple(
-        f"{names[one.camera]}: {refuted_lens(one)}; it was kept as given: correct it, or estimate it "
-        "with --refine-lenses"
+        f"{names[one.camera]}: {refuted_lens(one)}; it was kept as given: {remedy}"
         for one in refuted_lenses(problem, state)
     )
 
@@ -46,8 +48,8 @@ def sensitivities(
 
     problem, state, found: in the published world, the references among the covariance's information. With the normal
     matrix N and its inverse C the answer moves by C times the pull of the error: C[:, i] / std for a reference of
-    parameter i, whose weight is 1 / std², and -C N[:, f] std for a focal length f that was held. Of three axes, the
-    worst one. References without std have no error to speak of, and estimated lenses have theirs in the covariance.
+    parameter i or a focal length, whose weight is 1 / std², and -C N[:, f] std for a focal length f that was held. Of
+    three axes, the worst one. References without std have no error to speak of, and unknown lenses are not given.
     """
     free, base = problem.free_parameters, problem.free_columns()
     if not free.pose:
@@ -58,7 +60,7 @@ def sensitivities(
         freed = replace(problem, free_parameters=replace(free, lens=True))
         normal, columns = eliminate(build_system(freed, state, prior, robust=False)[0]).reduced, freed.free_columns()
         focal = normal.columns(np.searchsorted(columns, np.array(held) * CAMERA_PARAMETERS + FOCAL))
-        changes = found.spread(found.free @ focal[np.searchsorted(columns, base)] * -_LENS_STD)
+        changes = -found.spread(found.free @ focal[np.searchsorted(columns, base)])
         lenses = dict(zip(held, changes.T, strict=True))
     out: list[tuple[Sensitivity, ...]] = []
     for i, name in enumerate(names):
@@ -71,8 +73,12 @@ def sensitivities(
             moved = zip(found.spread(found.free @ axes).T, std.tolist(), strict=True)
             effects = [_effect(given, one, change, names, problem) for change, one in moved]
             mine.append(max(effects, key=lambda effect: effect.position))
+        lens, std_of_lens = problem.lens_prior(i), camera.focal_std or _LENS_STD
         if i in lenses:
-            mine.append(_effect("lens", _LENS_STD, lenses[i], names, problem))
+            mine.append(_effect("lens", std_of_lens, std_of_lens * lenses[i], names, problem))
+        elif camera.is_measured and lens is not None:
+            pull = (base == i * CAMERA_PARAMETERS + FOCAL) / lens.focal_std
+            mine.append(_effect("lens", lens.focal_std, found.spread(found.free @ pull), names, problem))
         out.append(tuple(mine))
     return out
 

@@ -139,7 +139,7 @@ def calibrate(
                 rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
             )
         report("covariances", 0.95)
-        return assemble_calibration(rig, solution)
+        return assemble_calibration(rig, solution, refine_lenses=refine_lenses)
     except Refused as refusal:
         failed = ((name, first_failure(tests)) for name, tests in refusal.acceptance.items())
         conflicting = {name: test for name, test in failed if test is not None and test.name == LAG_CONFLICT}
@@ -231,12 +231,10 @@ def solve_with_unknown_lenses(
             if not changed:
                 break
     except Refused as refusal:
-        reasons = {
-            name: refusal.cameras.get(name, "") for name in trial.cameras if trial.cameras[name].lens_prior is not None
-        }
+        reasons = {name: refusal.cameras.get(name, "") for name in prepared.uncalibrated if name in trial.cameras}
         without = replace(prepared, refused=_with_lens_failure(prepared, reasons))
         return solve_network(without, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough)
-    uncalibrated = [name for name in trial.cameras if trial.cameras[name].lens_prior is not None]
+    uncalibrated = [name for name in prepared.uncalibrated if name in trial.cameras]
     left = {name: solution.refused[name] for name in uncalibrated if name in solution.refused}
     refused = solution.refused | {
         name: reason for name, reason in _with_lens_failure(prepared, left).items() if name in left
@@ -300,8 +298,8 @@ def solve_network(
             reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
         refused |= unplaced
         tests: CameraTests = {}
-        lenses = [name for name in reconstruction.names if prepared.cameras[name].lens_prior is not None]
-        inconsistent = misfits(reconstruction, lenses)
+        guesses = [n for n, one in prepared.cameras.items() if one.lens_prior and not one.lens_prior.focal_only]
+        inconsistent = misfits(reconstruction, guesses)
         failure = inconsistent[0] if inconsistent else network_failure(reconstruction, graph.inlier_pairs, tests)
         if failure is None:
             break
@@ -377,7 +375,8 @@ def solve_paper(
 
     Poses by resection, or, where all rows have sizes (``sized``), by the distributed pose paper's method.
     """
-    refused = dict(prepared.refused)
+    kept = {name: replace(camera, lens_prior=None) for name, camera in prepared.cameras.items()}
+    prepared, refused = replace(prepared, cameras=kept), dict(prepared.refused)
     if pairs or sized is None:
         graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
     else:

@@ -10,7 +10,14 @@ import numpy as np
 from hub.bundle import covariance as cov
 from hub.bundle.datum.control_outliers import reject_outliers, reject_refuted
 from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
-from hub.bundle.datum.gauge import fix_gauge, identity_gauge, is_overdetermined, transform_state, with_exact_poses
+from hub.bundle.datum.gauge import (
+    at_control_points,
+    fix_gauge,
+    identity_gauge,
+    is_overdetermined,
+    transform_state,
+    with_exact_poses,
+)
 from hub.bundle.datum.held_gauge import similarity_to_published
 from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation_times, seen_by_two, sigma_limit
 from hub.bundle.model_comparison import REFUTED_SIGMA
@@ -21,7 +28,7 @@ from hub.bundle.problem import CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
-from hub.calibration.pairs.pair_network import RATE_TOLERANCE, pair_lag
+from hub.calibration.pairs.pair_network import RATE_TOLERANCE, coincide, pair_lag
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
 from hub.calibration.solution import Solution
 from hub.sync.hypothesis import PairSolution
@@ -43,10 +50,13 @@ _MAX_SAMPLES = 4_000_000
 """Of one path: 4.6 hours at 240 Hz."""
 
 
-def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | None = None) -> Calibration:
+def assemble_calibration(
+    rig: Rig, solution: Solution, published: Calibration | None = None, refine_lenses: bool = False
+) -> Calibration:
     """The calibration in the rig's world frame and units, on the reference camera's clock.
 
     published: an earlier calibration of the same cameras, whose world and scale are kept where the rig fixes none.
+    refine_lenses: whether measured lenses were free to change.
     """
     reconstruction = solution.reconstruction
     # The rig's order decides which camera is the reference and the first baseline.
@@ -58,12 +68,14 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     datum_points: list[tuple[int, Floats]] = []
     if solution.known is None:
         rig, control_outliers = reject_outliers(rig, names, [camera.pose for camera in state.cameras])
-        if is_overdetermined(rig, names) and problem.free_parameters.pose:
+        poses = [camera.pose for camera in state.cameras]
+        if is_overdetermined(rig, names, poses) and problem.free_parameters.pose:
             prior = estimate_smoothness(problem, state)
-            network = cov.covariance(problem, rescale_noise(problem, state, prior), prior).of_each_camera(*range(6))
-            rig, refuted = reject_refuted(rig, names, [camera.pose for camera in state.cameras], network)
+            scaled = rescale_noise(problem, state, prior)
+            network = cov.covariance(problem, scaled, prior, longest=True).of_each_camera(*range(6))
+            rig, refuted = reject_refuted(rig, names, poses, network)
             control_outliers += refuted
-        gauge = fix_gauge(rig, names, [camera.pose for camera in state.cameras])
+        gauge = fix_gauge(rig, names, poses)
         gauge = scaled_by_bars(gauge, measure_scale_bars(rig, reconstruction.labels, problem, state))
         if published is not None and gauge.scale == "arbitrary":
             held, datum_points = similarity_to_published(
@@ -76,10 +88,11 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
             gauge = replace(gauge, similarity=held)
         state = transform_state(state, gauge.similarity)
         adjustable = problem.free_parameters.pose and solution.solver != "paper"  # its method has no adjustment
-        if gauge.scale == "metric" and adjustable and is_overdetermined(rig, names):
+        if gauge.scale == "metric" and adjustable and is_overdetermined(rig, names, poses):
             prior = estimate_smoothness(problem, state)
             fitted = adjust_to_control_points(rig, names, problem, rescale_noise(problem, state, prior), prior)
             state = replace(fitted, sigma=state.sigma)
+            gauge = at_control_points(gauge, rig, names, [camera.pose for camera in state.cameras])
         if gauge.scale == "metric":
             state = with_exact_poses(rig, names, state)
     else:
@@ -89,8 +102,7 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
     scaled = rescale_noise(noisy, scaled, prior)
     covariance = cov.covariance(noisy, scaled, prior, gauge.information, datum_points, gauge.exact)
     effects = sensitivities(rig, names, noisy, scaled, prior, covariance)
-    lens_stds = focal_stds(problem, state, covariance)
-    readout_stds = np.sqrt(np.maximum(covariance.variances[:, READOUT], 0.0))
+    lens_stds, readout_stds = np.sqrt(np.maximum(covariance.variances[:, [FOCAL, READOUT]], 0.0)).T
     time_origins = [solution.prepared.time_origins[name] for name in names]
     time_scales = [solution.prepared.time_scale(name) for name in names]
     base = state.cameras[reference]
@@ -157,10 +169,10 @@ def assemble_calibration(rig: Rig, solution: Solution, published: Calibration | 
         warnings=solution.prepared.warnings
         + solution.warnings
         + control_outliers
+        + _unused_lengths(rig, names, reconstruction.labels)
         + gauge.warnings
-        + _estimated_lenses(cameras)
-        + _refined_lenses(names, problem, state)
-        + (refuted_lens_warnings(names, problem, state) if published is None else ())
+        + _estimated_lenses(rig, cameras)
+        + (refuted_lens_warnings(names, problem, state, refine_lenses) if published is None else ())
         + _other_frame_rates(rig, cameras, names[reference])
         + _estimated_readouts(cameras)
         + _estimated_jitter(names, state, time_scales)
@@ -226,34 +238,32 @@ def _reordered(problem: Problem, state: AdjustmentState, order: list[int]) -> tu
     )
 
 
-def focal_stds(problem: Problem, state: AdjustmentState, covariance: cov.Covariance | None = None) -> Floats:
-    """(cameras,) relative stds of estimated focal lengths; 0 where the lens was given."""
-    is_estimated = [bool(problem.lens_priors) and problem.lens_priors[i] is not None for i in range(len(state.cameras))]
-    if not any(is_estimated):
-        return np.zeros(len(is_estimated))
-    found = covariance or cov.covariance(problem, state, estimate_smoothness(problem, state))
-    return np.where(is_estimated, np.sqrt(np.maximum(found.variances[:, FOCAL], 0.0)), 0.0)
+def _estimated_lenses(rig: Rig, cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
+    """One sentence for each lens that was estimated: unknown, refined on request, or given with a std."""
+    out = []
+    for name, camera in cameras.items():
+        given, lens, std = rig.cameras[name], camera.intrinsics, f"{100 * camera.focal_std:.2g} % (std)"
+        if camera.focal_std > 0.0 and given.is_measured and given.intrinsics is not None:
+            before = given.intrinsics.focal
+            change = f"from {before:.1f} to {lens.focal:.1f} px ± {std}, by {100 * (lens.focal / before - 1):+.2g} %"
+            weight = f"; given ± {100 * given.focal_std:.2g} %" if given.focal_std else ""
+            if weight and abs(np.log(lens.focal / before)) > REFUTED_SIGMA * given.focal_std:
+                weight += ", which the observations refute"
+            out.append(f"{name}: its lens was refined: focal length {change}{weight}")
+        elif camera.focal_std > 0.0:
+            out.append(f"{name}: its lens was estimated from the trajectory: focal length {lens.focal:.1f} px ± {std}")
+    return tuple(out)
 
 
-def _estimated_lenses(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
-    """One sentence for each lens estimated by self-calibration."""
-    return tuple(
-        f"{name}: its lens was estimated from the trajectory: focal length {camera.intrinsics.focal:.1f} px ± "
-        f"{100 * camera.focal_std:.2g} % (std)"
-        for name, camera in cameras.items()
-        if camera.focal_std > 0.0
-    )
-
-
-def _refined_lenses(names: list[str], problem: Problem, state: AdjustmentState) -> tuple[str, ...]:
-    """One sentence for all given lenses that were refined within their tolerance."""
-    if not problem.lens_tolerances:
-        return ()
-    changes = ", ".join(
-        f"{name} {100 * (camera.intrinsics.focal / lens.focal - 1):+.1f} %"
-        for name, camera, lens in zip(names, state.cameras, problem.nominal, strict=True)
-    )
-    return (f"given lenses were refined within their tolerance: change of focal lengths {changes} (tolerance 1 %)",)
+def _unused_lengths(rig: Rig, names: list[str], labels: list[str]) -> tuple[str, ...]:
+    """One sentence for each distance and scale bar of which an end was not solved."""
+    out = []
+    for what, given, known in (("distance", rig.distances, names), ("scale bar (wand)", rig.scale_bars, labels)):
+        for a, b, _ in given:
+            missing = " and ".join(one for one in (a, b) if one not in known)
+            if missing:
+                out.append(f"the {what} {a}–{b} was not used: no solution has {missing}")
+    return tuple(out)
 
 
 def _other_frame_rates(rig: Rig, cameras: dict[str, CameraCalibration], reference: str) -> tuple[str, ...]:
@@ -442,13 +452,14 @@ def _pair_report(
     if pair.fundamental is None and a is not None and b is not None:
         middle = float(middles[names.index(pair.a), names.index(pair.b)])
         time_a, time_b = (_camera_clock(state, names, name, middle, solution) for name in (pair.a, pair.b))
-        relative = relative_pose_between(a.pose, b.pose)
+        matrices = a.intrinsics.matrix, b.intrinsics.matrix
+        in_one_place = coincide(a.pose.position, b.pose.position)  # then they have no epipolar geometry
         return PairReport(
             cameras=(pair.a, pair.b),
             status=pair.status,
             lag_s=time_a - time_b,
             clock_rate=b.time_map.clock_rate / a.time_map.clock_rate,
-            fundamental=fundamental_from(relative, a.intrinsics.matrix, b.intrinsics.matrix),
+            fundamental=None if in_one_place else fundamental_from(relative_pose_between(a.pose, b.pose), *matrices),
             inliers=None if fit is None else fit.inliers,
             rms_px=None if fit is None or not np.isfinite(fit.residual_px) else fit.residual_px,
             acceptance=pair.acceptance,

@@ -94,6 +94,8 @@ class DistributedPoseSolver:
         self.warnings = tuple(notices)
         # Later covariances include the poses, which this adjustment kept fixed.
         problem = replace(problem, free_parameters=replace(problem.free_parameters, pose=True))
+        if any(problem.lens_priors):  # the nodes keep lenses, and the poses follow from what is estimated of them
+            problem, state, _ = adjust(problem, state)
         return Reconstruction(reconstruction.names, reconstruction.labels, problem, state), refused
 
 

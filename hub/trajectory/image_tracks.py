@@ -21,6 +21,7 @@ from protocols.session.observations import Track as RawTrack
 
 MAX_PAUSE_S = 43_200.0
 """A longer gap [s] between two rows of a camera is a step of its clock, not a pause."""
+_COUNTED = 0.01  # of a gap: how nearly the frame numbers give it where it is a pause
 BRIDGED_GAP_S = 0.2
 """Gaps [s] up to this are bridged by the spline at any frame rate."""
 BRIDGED_INTERVALS = 3.2
@@ -146,13 +147,18 @@ def smooth_track(
 def without_clock_steps(tracks: list[RawTrack]) -> tuple[list[RawTrack], str]:
     """One camera's tracks without the rows before or after a step of its clock; and what was left out, or "".
 
-    A board that receives the time while it records (1970 to now) has two clock segments in one recording. No recording
-    pauses for half a day: so long a gap is a clock step, and the part with most rows is kept.
+    A board that receives the time while it records (1970 to now) has two clock segments in one recording. So long a gap
+    is a clock step, unless the frame numbers say that it is a pause, and the part with most rows is kept.
     """
     if not tracks:
         return tracks, ""
-    times = np.sort(np.concatenate([track.time for track in tracks]))
-    cuts = np.flatnonzero(np.diff(times) > MAX_PAUSE_S)
+    times = np.concatenate([track.time for track in tracks])
+    order = np.argsort(times, kind="stable")
+    times, frames = times[order], np.concatenate([track.frame for track in tracks])[order]
+    gaps, numbers = np.diff(times), np.diff(frames)
+    counted = numbers > 0
+    interval = float(np.median(gaps[counted] / numbers[counted])) if counted.any() else 0.0
+    cuts = np.flatnonzero(gaps > MAX_PAUSE_S)
     if len(cuts) == 0:
         return tracks, ""
     parts = np.split(times, cuts + 1)
@@ -163,8 +169,9 @@ def without_clock_steps(tracks: list[RawTrack]) -> tuple[list[RawTrack], str]:
         if inside.any():
             out.append(track.select(inside))
     dropped = len(times) - len(kept)
-    step = float(np.diff(times)[cuts].max())
-    return out, f"its clock steps by {step:.0f} s; {dropped} of {len(times)} rows on the other side are left out"
+    is_pause = np.abs(numbers * interval - gaps)[cuts].max() <= _COUNTED * gaps[cuts].max()
+    what = "by its frame numbers it pauses for" if is_pause else "its clock steps by"
+    return out, f"{what} {gaps[cuts].max():.0f} s; {dropped} of {len(times)} rows on the other side are left out"
 
 
 def neighbour_test(time: Floats, points: Floats, floor: float) -> Bools:

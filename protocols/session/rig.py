@@ -29,9 +29,10 @@ from protocols.geometry.types import Floats
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 CLOCKS = ("independent", "shared")
 MEASURED_FOCAL_STD = 0.02
-"""A focal length of at most this relative std counts as measured."""
+"""A lens whose focal length has at most this relative std counts as measured, all but the focal length."""
 MAX_READOUT_S = 0.06
 """Upper bound [s] of a rolling shutter's readout, from an image's first row to its last."""
+_MAX_READOUT_INTERVALS = 1.25  # frame intervals: an answer's estimated readout is at most that, and is read again
 _MAX_POINTS = 20_000  # of all rigid bodies
 _POSITION_TOLERANCE = 1e-3  # relative: position and translation may differ by rounding, not by more
 
@@ -43,7 +44,7 @@ class RigCamera:
     size: (width, height) [px]. fps: nominal, 0 = not given. intrinsics: None = uncalibrated.
     position: centre in the world [rig units]. rotation: (3, 3) camera from world.
     position_std: (3,) [rig units]. rotation_std: (3,) [rad]. body_from_camera: (3, 3).
-    focal_std: relative std of the focal length where the lens is nominal (a data sheet's); 0 = it was measured.
+    focal_std: relative std of the focal length; 0 = none is given, and it is exact.
     up: (3,) unit vector, away from the ground in the camera's own axes, as its accelerometer shows at rest.
     ball_outline: whether its rows are centroids of spheres' contours of diameter ``size``, detected without a known
     lens and so not yet corrected to the projection of the centre (``protocols/geometry/sphere_projection.py``).
@@ -65,6 +66,11 @@ class RigCamera:
     ball_outline: bool = False
     readout: float | None = None
     table: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the lens was measured: it is given, and no guess (a data sheet's)."""
+        return self.intrinsics is not None and self.focal_std <= MEASURED_FOCAL_STD
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,7 +299,7 @@ def _read_camera(table: _Table) -> RigCamera:
         focal_std=_read_focal_std(table),
         up=_read_up_of_camera(table),
         ball_outline=_read_ball_outline(table),
-        readout=_read_readout(table),
+        readout=_read_readout(table, float(fps)),
         table=dict(table.values),
     )
 
@@ -314,23 +320,26 @@ def _read_ball_outline(table: _Table) -> bool:
     return value
 
 
-def _read_readout(table: _Table) -> float | None:
+def _read_readout(table: _Table, fps: float) -> float | None:
     value = table.values.get("readout")
     if value is None:
         return None
     if not isinstance(value, int | float) or isinstance(value, bool) or not -MAX_READOUT_S <= value <= MAX_READOUT_S:
         remedy = "give the seconds from the image's first row to its last, as 0.02; below 0 if the last is read first"
         raise table.fail("readout", f"readout = {value!r}", remedy)
+    if fps > 0.0 and abs(value) > _MAX_READOUT_INTERVALS / fps:
+        longer = f"readout = {value!r} is longer than the {1e3 / fps:.3g} ms between two frames at fps = {fps:g}"
+        raise table.fail("readout", longer, "a sensor is read before its next frame: correct one of the two")
     return float(value)
 
 
 def _read_focal_std(table: _Table) -> float:
-    """The relative std of a nominal focal length; 0 for one that counts as measured."""
+    """The relative std of a focal length; 0 without one."""
     value = table.values.get("focal_std", 0.0)
     if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value <= 2.0:
         remedy = "give the focal length's relative std, as 0.1 for 10 %"
         raise table.fail("focal_std", f"focal_std = {value!r}", remedy)
-    return float(value) if value > MEASURED_FOCAL_STD else 0.0
+    return float(value)
 
 
 def _read_body(table: _Table) -> Floats | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from deploy.agents.malloc_tuning import retain_freed_memory
-from deploy.commands.common import Flag, Json, Scheduler
+from deploy.commands.common import Flag, Json, Scheduler, check_seed
 from deploy.offline.progress import progress_bar
 from hub.api import read_session
 from protocols.core.errors import EXIT_DONE, InputError, Refused
@@ -92,6 +92,7 @@ def calibrate(
     from hub.api import calibrate as solve
 
     check_folder(out)
+    check_seed(seed)
     options = CalibrationOptions(solver, from_known, seed=seed, refine_lenses=refine_lenses)
     read = _load(session, observations, out, marker, detector, json)
     read = _with_scale(read, height, limb)

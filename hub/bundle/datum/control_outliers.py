@@ -14,6 +14,7 @@ from hub.bundle.datum.gauge import (
     control_point_residuals,
     control_points_of,
     fit_to_control_points,
+    is_overdetermined,
 )
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
@@ -163,7 +164,7 @@ def reject_refuted(rig: Rig, names: list[str], poses: list[Pose], network: Float
     contradiction alike, neither is rejected, and both are named. References without std are named and kept.
     """
     control = control_points_of(rig, names)
-    if not control.fixes_scale:
+    if not control.fixes_scale or not is_overdetermined(replace(rig, distances=()), names, poses):
         return rig, ()
     found, _ = fit_to_control_points(rig, names, poses)
     published = [found.pose(pose) for pose in poses]

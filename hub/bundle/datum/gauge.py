@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.bundle.block_matrix import BlockSum
+from hub.bundle.covariance import gauge_generators
 from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState
 from protocols.core.errors import Refused
 from protocols.geometry import so3
@@ -24,8 +25,10 @@ _EXACT_STD = 1e-4
 """Std of a control point given without one, relative to the size of the rig, where the similarity is chosen among exact
 ones that contradict each other; the adjustment then holds them exactly."""
 _UP_STD = 0.01  # rad
-_GAUGE_FREEDOM = 7  # three of shift, three of rotation, one of scale
 CONTRADICTION_SIGMA = 8.0  # RMS residual in sigma from which contradicting control points are reported
+_COINCIDENT = 1e-9  # of the coordinates, or rig units: known positions that differ by no more are one
+_MAX_TURN_STD = 0.05  # rad: of the world's orientation, as of a camera's
+_MET = 1e-6  # of the rig's size, or rad: how nearly exact control points are met that do not contradict each other
 _MAX_CONTRADICTION = 0.1  # … and refused if they are off by more than this share of the rig's size, or rad
 
 
@@ -51,9 +54,10 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
         width = CAMERA_PARAMETERS * len(names)
         warnings: tuple[str, ...] = ()
         if control.positions or control.rotations:
-            warnings = (
-                "the control points fix no scale, so the first camera is the world: give two positions or a distance",
-            )
+            known = ", ".join(names[i] for i, _ in control.positions)
+            one_point = f": the known positions of {known} are one point" if len(control.positions) > 1 else ""
+            told = f"the control points fix no scale{one_point}, so the first camera is the world"
+            warnings = (f"{told}: give two positions or a distance",)
         none = BlockSum(np.zeros(width))
         return Gauge(_default_datum(rig, names, poses), "arbitrary", none, np.zeros((0, width)), warnings)
     best, final = fit_to_control_points(rig, names, poses)
@@ -64,7 +68,13 @@ def fix_gauge(rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
             refusal = Refused(f"the rig's control points contradict each other or the observations: worst is {worst}")
             refusal.permanent = True
             raise refusal
-        found.append(f"the rig's control points disagree by more than their stds: worst is {worst}")
+        found.append(f"the rig's control points disagree with each other or the observations: worst is {worst}")
+    if control.extent > 0.0 and _turn_std(best, control_point_residuals(rig, names, poses)) > _MAX_TURN_STD:
+        line = ", ".join(names[i] for i, _ in control.positions)
+        found.append(
+            f"the rotation of the world about the line through the known positions of {line} is not determined by the "
+            "references, and arbitrary: give a position off the line, a rotation or a levelled camera (up)"
+        )
     published = [best.pose(pose) for pose in poses]
     terms, exact = control_point_terms(rig, names, published), exact_constraints(rig, names, published)[0]
     return Gauge(best, "metric", terms.information, exact, tuple(found))
@@ -80,9 +90,10 @@ class ControlPoints:
 
     @property
     def extent(self) -> float:
-        """Extent of the known positions."""
+        """Extent of the known positions; 0 of those that rounding cannot tell apart."""
         known = [position for _, position in self.positions]
-        return float(np.linalg.norm(np.ptp(known, axis=0))) if len(known) >= 2 else 0.0
+        extent = float(np.linalg.norm(np.ptp(known, axis=0))) if len(known) >= 2 else 0.0
+        return extent if extent > _COINCIDENT * max(1.0, float(np.abs(known).max(initial=0.0))) else 0.0
 
     @property
     def fixes_scale(self) -> bool:
@@ -238,13 +249,7 @@ def _gauss_newton(start: Similarity, residual: Callable[[Similarity], Floats]) -
     now = start
     cost = float((residual(now) ** 2).sum())
     for _ in range(30):
-        value = residual(now)
-        jacobian = np.empty((len(value), 7))
-        for k in range(7):
-            step = np.zeros(7)
-            step[k] = 1e-6
-            jacobian[:, k] = (residual(_retract(now, step)) - residual(_retract(now, -step))) / 2e-6
-        step = np.asarray(-np.linalg.lstsq(jacobian, value, rcond=1e-9)[0], np.float64)
+        step = np.asarray(-np.linalg.lstsq(_jacobian(now, residual), residual(now), rcond=1e-9)[0], np.float64)
         trial = _retract(now, step)
         trial_cost = float((residual(trial) ** 2).sum())
         shrink = 1.0
@@ -256,6 +261,20 @@ def _gauss_newton(start: Similarity, residual: Callable[[Similarity], Floats]) -
             break
         now, cost = trial, trial_cost
     return now, cost
+
+
+def _jacobian(s: Similarity, residual: Callable[[Similarity], Floats]) -> Floats:
+    """Derivatives (n, 7) of the residuals by shift, rotation and log scale."""
+    steps = 1e-6 * np.eye(7)
+    return np.column_stack([(residual(_retract(s, one)) - residual(_retract(s, -one))) / 2e-6 for one in steps])
+
+
+def _turn_std(s: Similarity, residual: Callable[[Similarity], Floats]) -> float:
+    """Largest std [rad] of the rotation by residuals in sigma, shift and scale free."""
+    jacobian = _jacobian(s, residual)
+    others, turn = jacobian[:, [0, 1, 2, 6]], jacobian[:, 3:6]
+    left = turn - others @ np.linalg.lstsq(others, turn, rcond=None)[0]
+    return 1.0 / max(float(np.linalg.svd(left, compute_uv=False)[-1]), 1e-12)
 
 
 def _retract(s: Similarity, step: Floats) -> Similarity:
@@ -359,11 +378,33 @@ def _distance_row(i: int, j: int, poses: list[Pose]) -> tuple[Floats, float]:
     return row, far
 
 
-def is_overdetermined(rig: Rig, names: list[str]) -> bool:
-    """Whether the control points exceed the seven gauge freedoms."""
-    cameras = [rig.cameras[name] for name in names]
-    rows = sum(3 * (one.position is not None) + 3 * (one.rotation is not None) for one in cameras)
-    return rows + sum(a in names and b in names for a, b, _ in rig.distances) > _GAUGE_FREEDOM
+def is_overdetermined(rig: Rig, names: list[str], poses: list[Pose]) -> bool:
+    """Whether the control points exceed the gauge freedoms that they fix; ``poses`` in any world."""
+    control = control_points_of(rig, names)
+    rows = 3 * len(control.positions) + 3 * len(control.rotations) + len(control.distances)
+    exact = {n: replace(c, position_std=None, rotation_std=None) for n, c in rig.cameras.items()}
+    design = exact_constraints(replace(rig, cameras=exact), names, poses)[0] @ gauge_generators(poses)
+    return rows > int(np.linalg.matrix_rank(design, tol=1e-6 * float(np.abs(design).max(initial=0.0))))
+
+
+def at_control_points(gauge: Gauge, rig: Rig, names: list[str], poses: list[Pose]) -> Gauge:
+    """The gauge for ``poses`` adjusted to the control points, with a warning of exact ones that contradict each other.
+
+    What they say is in directions of these poses: a distance along another would hold a rotation.
+    """
+    exact = {
+        name: replace(
+            one,
+            position=None if one.position_std is not None and one.position_std.any() else one.position,
+            rotation=None if one.rotation_std is not None and one.rotation_std.any() else one.rotation,
+        )
+        for name, one in rig.cameras.items()
+    }
+    control = control_points_of(replace(rig, cameras=exact), names)
+    worst, share = _worst_control_point(names, poses, control, Similarity(1.0, np.eye(3), np.zeros(3)))
+    unmet = (f"exact control points contradict each other, worst is {worst}: give stds",) if share > _MET else ()
+    information, rows = control_point_terms(rig, names, poses).information, exact_constraints(rig, names, poses)[0]
+    return replace(gauge, information=information, exact=rows, warnings=gauge.warnings + unmet)
 
 
 def with_exact_poses(rig: Rig, names: list[str], state: AdjustmentState) -> AdjustmentState:

@@ -79,7 +79,7 @@ def rescale_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPri
     """
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return state
-    found, none = covariance(problem, state, prior), np.zeros(len(state.cameras))
+    found, none = covariance(problem, state, prior, longest=True), np.zeros(len(state.cameras))
     noise = _over_redundancy(residual_std(problem, state), problem, state, found, none, _MAX_ROWS)
     modelled = [modelled_inflation(problem, state, camera) for camera in range(len(state.cameras))]
     return replace(state, sigma=noise * np.sqrt(np.maximum(correlation_inflation(problem, state), modelled)))

@@ -85,7 +85,7 @@ def _prepare(rig: Rig, observations: Observations, known: FixedCalibration | Non
         if known is not None and name not in known.cameras:
             refused[name] = "not in the known calibration"
             continue
-        unknown = camera.intrinsics is None or camera.focal_std > 0.0
+        unknown = not camera.is_measured
         lens = camera.intrinsics
         if unknown:
             found = initial_lens(seen, camera.size)

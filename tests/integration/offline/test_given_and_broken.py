@@ -22,6 +22,7 @@ from hub.sync.pair_solver import _PairSearch
 from protocols.core.clocks import CameraTime, ReferenceTime
 from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
 from protocols.session.calibration import Calibration, FixedCalibration
 from protocols.session.folder import read_folder
 from protocols.session.observations import Observations, gather_tracks
@@ -32,6 +33,7 @@ from tests.bench.clock_steps import Put, stepped
 from tests.bench.pose_worlds import FOCAL, cube, errors, joint_optimum, observe, section_4
 from tests.bench.simulated_rigs import make_rallies
 from tests.support import rigs
+from tests.support.rigs import random_poses
 
 DRONE2 = Path(__file__).parents[4] / "shared" / "data" / "drone2"
 DRONE1 = DRONE2.with_name("drone1")
@@ -67,6 +69,32 @@ def test_a_wrong_lens_is_kept_and_named_and_right_ones_are_not(four: tuple[rigs.
         assert given is not None
         assert np.array_equal(camera.intrinsics.matrix, given.matrix)
         assert np.array_equal(camera.intrinsics.distortions, given.distortions)
+
+
+@pytest.mark.parametrize("solver", ["joint", "distributed"])
+def test_a_focal_length_with_a_std_is_an_observation_of_that_weight(solver: str) -> None:
+    session = rigs.simulate(3, 4, 30.0)
+    given = {name: replace(camera, focal_std=0.01) for name, camera in session.rig.cameras.items()}
+    wrong = replace(session, rig=replace(session.rig, cameras=given))
+    for name, factor in (("cam1", 1.012), ("cam2", 0.99)):
+        wrong = with_focal(wrong, name, factor)
+    found = calibrate(wrong.rig, wrong.observations(), solver=solver)
+    for name, camera in found.cameras.items():
+        lens = session.rig.cameras[name].intrinsics
+        assert lens is not None
+        assert abs(camera.intrinsics.focal / lens.focal - 1.0) < 4.0 * camera.focal_std < 0.02
+        assert np.array_equal(camera.intrinsics.distortions, lens.distortions)
+        assert [one.std for one in camera.sensitivities] == [0.01]
+        assert any(text.startswith(f"{name}: its lens was refined: focal length from") for text in found.warnings)
+
+
+def test_refined_lenses_are_told_with_their_stds(four: tuple[rigs.Session, Calibration]) -> None:
+    wrong = with_focal(four[0], "cam1", 1.012)
+    found = calibrate(wrong.rig, wrong.observations(), refine_lenses=True)
+    for name, camera in found.cameras.items():
+        told = f"{camera.intrinsics.focal:.1f} px ± {100 * camera.focal_std:.2g} % (std)"
+        assert any(text.startswith(f"{name}: its lens was refined") and told in text for text in found.warnings)
+        assert next(t.value for t in found.acceptance[name] if t.name == "std of the focal length") > 0.0
 
 
 @pytest.mark.parametrize("solver", ["joint", "distributed"])
@@ -318,6 +346,51 @@ def test_known_cameras_in_one_place_are_refused_in_one_line(four: tuple[rigs.Ses
         calibrate(session.rig, session.observations(), known=FixedCalibration(cameras, "metric"))
     with pytest.raises(Refused, match="in one place"):
         triangulate(session.rig, cameras, session.observations())
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-3])
+def test_exact_poses_of_two_cameras_in_one_place_are_no_fault(monkeypatch: pytest.MonkeyPatch, gap: float) -> None:
+    """In the datum of their baseline all else was uncertain, and true references 1 mm apart were called wrong."""
+
+    def beside(rng: np.random.Generator, count: int) -> list[Pose]:
+        first, _, *others = random_poses(rng, count)
+        return [first, Pose(first.rotation, first.position + [gap, 0.0, 0.0]), *others]
+
+    monkeypatch.setattr(rigs, "random_poses", beside)
+    session = rigs.simulate(5, 3, 20.0)
+    known = {
+        name: replace(camera, position=session.poses[name].position, rotation=session.poses[name].rotation)
+        for name, camera in session.rig.cameras.items()
+    }
+    found = calibrate(replace(session.rig, cameras=known), session.observations())
+    assert not found.warnings
+    again = calibrate(session.rig, session.observations(), known=FixedCalibration(dict(found.cameras), "metric"))
+    for one in (found, again):
+        assert abs(session.clock_error("cam2", "cam0", one.cameras["cam2"].time_map)) < 1e-3
+        assert [pair.fundamental is None for pair in one.pairs] == [gap == 0.0, False, False]
+
+
+@pytest.mark.parametrize("positions", [0, 2])
+def test_exact_distances_are_exact_and_contradicting_ones_are_named(
+    four: tuple[rigs.Session, Calibration], positions: int
+) -> None:
+    session, _ = four
+    places = {name: pose.position for name, pose in session.poses.items()}
+    cameras = dict(session.rig.cameras)
+    for name in list(cameras)[:positions]:
+        cameras[name] = replace(cameras[name], position=places[name])
+    between = [("cam0", "cam1"), ("cam0", "cam2"), ("cam1", "cam2")]
+    lengths = tuple((a, b, float(np.linalg.norm(places[a] - places[b]))) for a, b in between)
+    found = calibrate(replace(session.rig, cameras=cameras, distances=lengths), session.observations())
+    for a, b, length in lengths:
+        apart = found.cameras[a].pose.position - found.cameras[b].pose.position
+        assert np.linalg.norm(apart) == pytest.approx(length, rel=1e-9)
+    assert not [text for text in found.warnings if "contradict" in text or "disagree" in text]
+    assert found.cameras["cam3"].position_std.max() < 0.02
+    if positions:
+        wrong = (("cam0", "cam1", lengths[0][2] + 0.01), *lengths[1:])
+        told = calibrate(replace(session.rig, cameras=cameras, distances=wrong), session.observations()).warnings
+        assert any("contradict each other, worst is the distance cam0–cam1, 0.01 off" in text for text in told)
 
 
 def test_no_row_of_a_path_is_outside_the_observed_span(four: tuple[rigs.Session, Calibration]) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -69,6 +70,32 @@ def test_a_clock_that_is_set_while_recording_costs_its_shorter_side(filmed: Sess
     assert filmed.true_time("cam1", middle) == pytest.approx(filmed.true_time(found.reference, reference), abs=1e-3)
 
 
+def test_a_pause_of_a_day_is_no_clock_step(filmed: Session) -> None:
+    tracks = {}
+    for (name, label), track in filmed.observations().tracks.items():
+        late = track.time > track.time[0] + 12.0
+        day = round(86_400.0 * filmed.rig.cameras[name].fps)
+        interval = float(np.median(np.diff(track.time) / np.diff(track.frame)))
+        tracks[name, label] = replace(
+            track, frame=track.frame + np.where(late, day, 0), time=track.time + np.where(late, day * interval, 0.0)
+        )
+    found = calibrate(filmed.rig, Observations(tracks))
+    assert len([text for text in found.warnings if "by its frame numbers it pauses for" in text]) == 3
+    assert not [text for text in found.warnings if "its clock steps by" in text]
+
+
+def test_lengths_without_an_end_are_named_and_a_readout_is_no_longer_than_a_frame(
+    filmed: Session, tmp_path: Path
+) -> None:
+    rig = replace(filmed.rig, distances=(("cam0", "cam9", 3.0),), scale_bars=(("a", "b", 0.5),))
+    told = calibrate(rig, filmed.observations()).warnings
+    assert "the distance cam0–cam9 was not used: no solution has cam9" in told
+    assert "the scale bar (wand) a–b was not used: no solution has a and b" in told
+    (tmp_path / "rig.toml").write_text("[cam0]\nsize = [640, 480]\nfps = 50.0\nreadout = 0.05\n")
+    with pytest.raises(InputError, match="longer than the 20 ms between two frames"):
+        read_rig(tmp_path / "rig.toml")
+
+
 def test_contradicting_distances_are_refused(
     filmed: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,6 +103,7 @@ def test_contradicting_distances_are_refused(
     folder = write_session(tmp_path / "session", filmed, metadata)
     assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 3
     assert "contradict" in capsys.readouterr().err
+    assert run(["calibrate", str(folder), "--solver", "distributed", "--seed", "-1", "--out", str(tmp_path / "o")]) == 2
 
 
 def test_an_answer_with_distances_is_plain_toml_in_the_rigs_units(filmed: Session, tmp_path: Path) -> None:

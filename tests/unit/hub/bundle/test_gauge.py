@@ -298,9 +298,22 @@ def test_cameras_in_a_line_do_not_mirror_the_world() -> None:
         np.testing.assert_allclose(moved.position, pose.position, atol=1e-6)
 
 
-def test_two_equal_positions_fix_no_scale() -> None:
-    """A wrong entry must not cause a division by zero or a zero scale."""
-    _, internal, _ = simulated_world(14)
-    known = {"cam0": {"position": np.zeros(3)}, "cam1": {"position": np.zeros(3)}}
-    gauge = fix_gauge(rig(known), NAMES, internal)
-    assert gauge.warnings or gauge.scale == "arbitrary"
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_line_of_positions_leaves_a_turn_about_it_which_is_told(count: int) -> None:
+    rng = np.random.default_rng(1)
+    line, truth = rng.normal(size=3), random_poses(rng, 4)
+    poses = [*(replace(pose, position=i * line) for i, pose in enumerate(truth[:count])), *truth[count:]]
+    known: dict[str, dict[str, Floats]] = {NAMES[i]: {"position": poses[i].position} for i in range(count)}
+    (told,) = fix_gauge(rig(known), NAMES, poses).warnings
+    assert f"the line through the known positions of {', '.join(NAMES[:count])} is not determined" in told
+    known["cam3"] = {"rotation": poses[3].rotation}
+    assert not fix_gauge(rig(known), NAMES, poses).warnings
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-12])
+def test_positions_that_are_one_point_are_named(apart: float) -> None:
+    truth, internal, _ = simulated_world(3)
+    place = truth[0].position
+    gauge = fix_gauge(rig({"cam0": {"position": place}, "cam1": {"position": place + apart}}), NAMES, internal)
+    assert gauge.scale == "arbitrary"
+    assert "the known positions of cam0, cam1 are one point" in gauge.warnings[0]
