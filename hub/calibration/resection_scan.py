@@ -18,7 +18,7 @@ import numpy as np
 from numpy.fft import irfft, rfft
 
 from hub.bundle.initialisation import CameraInput, Reconstruction, observation_times, seen_by_two
-from hub.bundle.model_comparison import MAX_STEP_S
+from hub.bundle.model_comparison import STEP_SIZES, best_split
 from hub.bundle.problem import CameraState, Trajectory
 from hub.clocks.clock_graph import TimeMapEstimate
 from hub.sync.lag_scan import fast_length, grid_tracks
@@ -46,7 +46,6 @@ wide or narrow that a lens is mistaken by more."""
 _SCALE_STEPS = (1.04, 1.02, 1.01, 1.005)
 _LIKELY_CANDIDATES, _MIN_SCALE_CHANGE = 4, 0.03
 """Candidates of the moment scan, which does not use the lens, whose scale is searched; scale that the lens gives."""
-_STEP_SIZES = np.linspace(-MAX_STEP_S, MAX_STEP_S, 81)  # s: 5 ms apart, refined by the adjustment
 _TRIMS = 2  # fits of a pose to the better half of the points
 _MIN_INLIERS, _MIN_CANDIDATE_RATIO = 0.8, 4.0
 """Share of the common rows that a time map without any bound from a clock has to explain, and cost of the next best."""
@@ -197,12 +196,13 @@ def find_time_map(
     if not verified:
         return None, "too little seen together with the other cameras"
     if reason := _misfit(verified):
-        verified = [one for some in nominal[:_CANDIDATES] for one in _verify_with_step(some, samples, camera)]
-        if not verified or _misfit(verified):
+        likely = nominal[:_LIKELY_CANDIDATES]
+        verified += [one for candidate in likely for one in _verify_with_step(candidate, samples, camera)]
+        if _misfit(verified):
             return None, reason
     best, reason = _best_and_next(verified)[0], ""
     if best.step is not None:
-        size, at = 1e3 * (best.step.before - best.step.after) / best.rate, best.step.time + labels[0].track.time_origin
+        size, at = 1e3 * (best.step.after - best.step.before), best.step.time + labels[0].track.time_origin
         reason = f"its clock seems to step by {size:+.0f} ms at its time {at:.1f} s"
     centre = 0.5 * (min(float(one.track.time[0]) for one in labels) + max(float(one.track.time[-1]) for one in labels))
     return TimeMapEstimate(best.rate, best.rate * centre + best.offset, centre), reason
@@ -271,7 +271,7 @@ def _moment_scan(labels: list[_SeenLabel], moments: _PathMoments | None, rate: f
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """What a clock step adds to internal times [s] before and from camera time ``time`` on; one of them is 0."""
+    """What a clock step adds to camera times [s] before and from ``time`` on; one of them is 0."""
 
     time: float
     before: float
@@ -305,9 +305,8 @@ def _common(
     """Positions (n, 3), image points (n, 2) and internal times (n,) of the rows where two others saw the path."""
     world, image, times = [], [], []
     for label, time, points in samples:
-        internal = np.asarray(rate * time + offset, dtype=np.float64)
-        if step is not None:
-            internal += np.where(time < step.time, step.before, step.after)
+        even = time if step is None else time - np.where(time < step.time, step.before, step.after)
+        internal = np.asarray(rate * even + offset, dtype=np.float64)
         where = label.path.at(internal)
         good = np.isfinite(where).all(axis=1) & seen_by_two(label.observed, internal)
         world.append(where[good])
@@ -367,24 +366,20 @@ def _verify_with_step(candidate: TimeMapCandidate, samples: list[_Sample], camer
     A step is in one of the halves; the other one, which it does not touch, is of the longer part.
     """
     times = np.concatenate([time for _, time, _ in samples])
+    image = np.concatenate([points for _, _, points in samples])
     order, middle, out = np.argsort(times, kind="stable"), float(np.median(times)), []
     for late in (False, True):
         half = [(label, time[part], at[part]) for label, time, at in samples for part in [(time >= middle) == late]]
-        near = replace(candidate, offset=_verify(candidate, half, camera).offset)
-        positions, seen, _ = _common(half, near.rate, near.offset)
-        pose, costs = _resect(positions, seen) if len(positions) >= _MIN_POINTS else None, []
-        for size in _STEP_SIZES:
-            moved = [label.path.at(near.rate * time + near.offset + size) for label, time, _ in samples]
-            image = np.concatenate([points for _, _, points in samples])
+        placed = _verify(candidate, half, camera)
+        if placed.inliers < _MIN_INLIERS:
+            continue
+        near = replace(candidate, offset=placed.offset)
+        pose, costs = _resect(*_common(half, near.rate, near.offset)[:2]), []
+        for size in STEP_SIZES:
+            moved = [label.path.at(near.rate * (time - size) + near.offset) for label, time, _ in samples]
             residual = _reprojection(pose, np.concatenate(moved), image, camera.intrinsics.focal)
             costs.append(np.minimum(residual, _TRUNCATION_PX)[order] ** 2)
-        until = np.cumsum(np.array(costs), axis=1)  # of the rows up to each one
-        still = until[len(until) // 2]
-        joint = until + still[-1] - still if late else still + until[:, -1:] - until
-        k, last = divmod(int(np.argmin(joint)), len(times))
-        shifts = (float(_STEP_SIZES[k]), 0.0) if late else (0.0, float(_STEP_SIZES[k]))
-        step = _Step(float(times[order][min(last + 1, len(times) - 1)]), *shifts)
-        out.append(_verify(near, samples, camera, step=step))
+        out.append(_verify(near, samples, camera, step=_Step(*best_split(times[order], np.array(costs))[:3])))
     return out
 
 
