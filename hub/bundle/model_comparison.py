@@ -41,6 +41,7 @@ from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.banded import cho_solve_banded
 from protocols.geometry.types import Floats, Ints
+from protocols.session.rig import MAX_READOUT_S
 
 _FALSE_ALARM_PROBABILITY = 1e-4
 """Probability that one of the lenses of a correct rig is refuted."""
@@ -215,7 +216,8 @@ def are_readouts_plausible(problem: Problem, state: AdjustmentState) -> bool:
     """
     for number, camera in enumerate(state.cameras):
         longest = problem.longest_readout(number)
-        if not -_READOUT_MARGIN * longest < camera.readout < (1.0 + _READOUT_MARGIN) * longest:
+        most = min((1.0 + _READOUT_MARGIN) * longest, MAX_READOUT_S)
+        if not -_READOUT_MARGIN * longest < camera.readout < most:
             return False
     return True
 
@@ -259,7 +261,7 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
         return rejected  # no errors last, as a step's would
     # A camera that steps has the most correlated residuals of all, for that reason: here it must not count for less.
     linear, trials = _Linearised.of(problem, state, state.sigma * np.sqrt(np.median(inflation))), []
-    needed = _needed_for_a_step(problem)
+    needed = needed_for_a_step(problem)
     for camera in range(len(state.cameras)):
         used = [part.time[part.use] for part in problem.rows if part.camera == camera]
         times = np.unique(np.concatenate([np.zeros(0), *used]))
@@ -332,10 +334,11 @@ def is_step_supported(problem: Problem, step: ClockStep) -> bool:
 
     What was a step of a linear model, in noise that it explained, may be little once it is estimated.
     """
-    return (step.size / step.std) ** 2 > _needed_for_a_step(problem)
+    return (step.size / step.std) ** 2 > needed_for_a_step(problem)
 
 
-def _needed_for_a_step(problem: Problem) -> float:
+def needed_for_a_step(problem: Problem) -> float:
+    """The chi-squared that one clock step needs, of all that are tried in a recording."""
     return _evidence_needed(problem, 2, _STEP_TIMES * len(problem.nominal))
 
 

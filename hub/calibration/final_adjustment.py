@@ -52,7 +52,9 @@ def _steps_or_rates(
     alike = tuple(replace(camera, rate=rate) for camera in state.cameras)
     held = replace(problem, crystal_rates=(True,) * len(alike))
     stepped = _with_clock_steps(*adjust(held, replace(state, cameras=alike), rounds=4)[:2])
-    return stepped if stepped[1].clock_steps and _bic_prefers(*stepped, *found, 2) else found
+    # As much as it takes to look for the steps: lenses that are wrong by slow errors make false rates, and false steps.
+    needed = len(stepped[1].clock_steps) * model_comparison.needed_for_a_step(problem)
+    return stepped if needed and _gain(*stepped, *found)[0] > needed else found
 
 
 def _with_sizes(problem: Problem, state: AdjustmentState, new: ClockStep) -> tuple[Problem, AdjustmentState]:
@@ -165,10 +167,17 @@ def _bic_prefers(
 
     It uses the robust likelihood of all rows under each solution's own noise, at the effective sample size.
     """
+    gain, rows = _gain(freed, freed_state, fixed, fixed_state)
+    return bool(gain > parameters * np.log(max(rows, 2)))
+
+
+def _gain(
+    freed: Problem, freed_state: AdjustmentState, fixed: Problem, fixed_state: AdjustmentState
+) -> tuple[float, float]:
+    """By how much the deviance is less, and the effective rows."""
     inflation = correlation_inflation(freed, freed_state)
     rows = sum(len(part.time) / inflation[part.camera] for part in fixed.rows)
-    gain = float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / inflation).sum())
-    return bool(gain > parameters * np.log(max(rows, 2)))
+    return float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / inflation).sum()), float(rows)
 
 
 def _deviances(problem: Problem, state: AdjustmentState) -> Floats:
