@@ -31,10 +31,30 @@ def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem
         if step is None:
             break
         trial, found = _with_sizes(problem, state, step)
-        if not all(model_comparison.is_step_supported(problem, one) for one in found.clock_steps):
+        supported = all(model_comparison.is_step_supported(problem, one) for one in found.clock_steps)
+        if not supported or not _bic_prefers(trial, found, problem, state, 2):
             break
         problem, state = trial, found
     return problem, state
+
+
+def _steps_or_rates(
+    even: tuple[Problem, AdjustmentState], found: tuple[Problem, AdjustmentState]
+) -> tuple[Problem, AdjustmentState]:
+    """What was ``found`` from the adjusted clocks ``even``; steps of clocks that all run alike if these explain more.
+
+    Where a clock steps and its rate is free, a false rate explains most of the step.
+    """
+    problem, state = even
+    if all(model_comparison.with_crystal_rates(*found).crystal_rates):
+        return found
+    rate = float(np.median([camera.rate for camera in state.cameras]))
+    alike = tuple(replace(camera, rate=rate) for camera in state.cameras)
+    held = replace(problem, crystal_rates=(True,) * len(alike))
+    stepped = _with_clock_steps(*adjust(held, replace(state, cameras=alike), rounds=4)[:2])
+    # As much as it takes to look for the steps: lenses that are wrong by slow errors make false rates, and false steps.
+    needed = len(stepped[1].clock_steps) * model_comparison.needed_for_a_step(problem)
+    return stepped if needed and _gain(*stepped, *found)[0] > needed else found
 
 
 def _with_sizes(problem: Problem, state: AdjustmentState, new: ClockStep) -> tuple[Problem, AdjustmentState]:
@@ -99,7 +119,9 @@ def final_adjustment(
             return reconstruction  # the camera will be left out
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     if not (warm and online):
-        problem, state = _with_clock_steps(problem, state)
+        even = problem, state
+        problem, state = _with_clock_steps(*even)
+        problem, state = (problem, state) if online else _steps_or_rates(even, (problem, state))
     if not online and problem.free_parameters.clock:
         problem, state = _with_readouts(problem, state, report)
     problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
@@ -145,10 +167,17 @@ def _bic_prefers(
 
     It uses the robust likelihood of all rows under each solution's own noise, at the effective sample size.
     """
+    gain, rows = _gain(freed, freed_state, fixed, fixed_state)
+    return bool(gain > parameters * np.log(max(rows, 2)))
+
+
+def _gain(
+    freed: Problem, freed_state: AdjustmentState, fixed: Problem, fixed_state: AdjustmentState
+) -> tuple[float, float]:
+    """By how much the deviance is less, and the effective rows."""
     inflation = correlation_inflation(freed, freed_state)
     rows = sum(len(part.time) / inflation[part.camera] for part in fixed.rows)
-    gain = float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / inflation).sum())
-    return bool(gain > parameters * np.log(max(rows, 2)))
+    return float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / inflation).sum()), float(rows)
 
 
 def _deviances(problem: Problem, state: AdjustmentState) -> Floats:

@@ -11,12 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 from numpy.fft import irfft, rfft
 
 from hub.bundle.initialisation import CameraInput, Reconstruction, observation_times, seen_by_two
+from hub.bundle.model_comparison import STEP_SIZES, best_split
 from hub.bundle.problem import CameraState, Trajectory
 from hub.clocks.clock_graph import TimeMapEstimate
 from hub.sync.lag_scan import fast_length, grid_tracks
@@ -145,6 +147,10 @@ class _SeenLabel:
     observed: list[Floats]
 
 
+_Sample: TypeAlias = tuple[_SeenLabel, Floats, Floats]
+"""A label, and times (n,) and normalised points (n, 2) evenly along its track."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _PathMoments:
     """The paths on a grid from internal time ``begin``: products (10, labels, times) of the homogeneous points."""
@@ -158,11 +164,14 @@ def find_time_map(
 ) -> tuple[TimeMapEstimate | None, str]:
     """Time map of a camera from its view of a solved path, over all lags and the given rates; else why there is none.
 
+    With both, its clock seems to step, and the map holds for the longer part.
+
     rates: the nominal one first; where no lag fits at it, the camera is also tried with other focal lengths.
 
     The resection of every lag comes from the same sums over the rows (`_moment_scan`), so a rate costs as much as some
     correlations. The best candidates are verified by a calibrated resection, which has to be by far the best of all
-    lags, to explain most of the common rows, and to predict either half of them from the other half.
+    lags, to explain most of the common rows, and to predict either half of them from the other half. Where none does,
+    the same is asked of candidates with a clock step.
     """
     tracks = {label: track for label, track in camera.tracks.items() if isinstance(track, SmoothTrack)}
     paths = reconstruction.state.trajectories
@@ -173,24 +182,30 @@ def find_time_map(
     ]
     if not labels:
         return None, "no label that the others saw"
-    moments = _path_moments(labels)
+    moments, samples = _path_moments(labels), [(one, *_along_path(one.track)) for one in labels]
     nominal = sorted(_moment_scan(labels, moments, rates[0]), key=lambda one: one.score)
-    verified = [_verify(one, labels, camera) for one in nominal[:_LIKELY_CANDIDATES]]
+    verified = [_verify(one, samples, camera) for one in nominal[:_LIKELY_CANDIDATES]]
     if verified and _misfit(verified):
         likely = nominal[:_LIKELY_CANDIDATES]
-        reason = _other_image([_verify(one, labels, camera, _SCALES) for one in likely])
+        reason = _other_image([_verify(one, samples, camera, _SCALES) for one in likely])
         if reason:
             return None, reason
     found = [candidate for rate in rates[1:] for candidate in _moment_scan(labels, moments, rate)]
     found = sorted([*found, *nominal[_LIKELY_CANDIDATES:]], key=lambda one: one.score)[: _CANDIDATES - len(verified)]
-    verified += [_verify(one, labels, camera) for one in found]
+    verified += [_verify(one, samples, camera) for one in found]
     if not verified:
         return None, "too little seen together with the other cameras"
     if reason := _misfit(verified):
-        return None, reason
-    best = _best_and_next(verified)[0]
+        likely = nominal[:_LIKELY_CANDIDATES]
+        verified += [one for candidate in likely for one in _verify_with_step(candidate, samples, camera)]
+        if _misfit(verified):
+            return None, reason
+    best, reason = _best_and_next(verified)[0], ""
+    if best.step is not None:
+        size, at = 1e3 * (best.step.after - best.step.before), best.step.time + labels[0].track.time_origin
+        reason = f"its clock seems to step by {size:+.0f} ms at its time {at:.1f} s"
     centre = 0.5 * (min(float(one.track.time[0]) for one in labels) + max(float(one.track.time[-1]) for one in labels))
-    return TimeMapEstimate(best.rate, best.rate * centre + best.offset, centre), ""
+    return TimeMapEstimate(best.rate, best.rate * centre + best.offset, centre), reason
 
 
 def _path_moments(labels: list[_SeenLabel]) -> _PathMoments | None:
@@ -255,6 +270,15 @@ def _moment_scan(labels: list[_SeenLabel], moments: _PathMoments | None, rate: f
 
 
 @dataclass(frozen=True, slots=True)
+class _Step:
+    """What a clock step adds to camera times [s] before and from ``time`` on; one of them is 0."""
+
+    time: float
+    before: float
+    after: float
+
+
+@dataclass(frozen=True, slots=True)
 class _Verified:
     """A candidate after resection at the best lag near it.
 
@@ -268,32 +292,41 @@ class _Verified:
     cost: float
     inliers: float
     predicts: bool
+    step: _Step | None = None
 
     @property
     def fits(self) -> bool:
         return self.inliers >= _MIN_INLIERS and self.predicts
 
 
+def _common(
+    samples: list[_Sample], rate: float, offset: float, step: _Step | None = None
+) -> tuple[Floats, Floats, Floats]:
+    """Positions (n, 3), image points (n, 2) and internal times (n,) of the rows where two others saw the path."""
+    world, image, times = [], [], []
+    for label, time, points in samples:
+        even = time if step is None else time - np.where(time < step.time, step.before, step.after)
+        internal = np.asarray(rate * even + offset, dtype=np.float64)
+        where = label.path.at(internal)
+        good = np.isfinite(where).all(axis=1) & seen_by_two(label.observed, internal)
+        world.append(where[good])
+        image.append(points[good])
+        times.append(internal[good])
+    return np.concatenate(world), np.concatenate(image), np.concatenate(times)
+
+
 def _verify(
     candidate: TimeMapCandidate,
-    labels: list[_SeenLabel],
+    samples: list[_Sample],
     camera: CameraInput,
     scales: Sequence[Floats] = (),
+    step: _Step | None = None,
 ) -> _Verified:
     """The candidate at the best lag near it, with the lens as it is given or at the best of ``scales``."""
-    samples = [(one, *_along_path(one.track)) for one in labels]
 
     @lru_cache(maxsize=1)
     def common(offset: float) -> tuple[Floats, Floats, Floats]:
-        world, image, times = [], [], []
-        for label, time, points in samples:
-            internal = np.asarray(candidate.rate * time + offset, dtype=np.float64)
-            where = label.path.at(internal)
-            good = np.isfinite(where).all(axis=1) & seen_by_two(label.observed, internal)
-            world.append(where[good])
-            image.append(points[good])
-            times.append(internal[good])
-        return np.concatenate(world), np.concatenate(image), np.concatenate(times)
+        return _common(samples, candidate.rate, offset, step)
 
     def cost(offset: float, scale: Floats) -> float:
         positions, seen, _ = common(offset)
@@ -305,8 +338,8 @@ def _verify(
 
     scale, offset = min(scales, key=lambda one: cost(candidate.offset, one), default=np.ones(2)), candidate.offset
     lowest = cost(offset, scale)
-    for step in (_STEP_S / 2, _STEP_S / 4, _STEP_S / 8, _STEP_S / 16):
-        for trial in (offset - step, offset + step):
+    for change in (_STEP_S / 2, _STEP_S / 4, _STEP_S / 8, _STEP_S / 16):
+        for trial in (offset - change, offset + change):
             there = cost(trial, scale)
             if there < lowest:
                 offset, lowest = trial, there
@@ -315,7 +348,7 @@ def _verify(
     positions, seen, when = common(offset)
     seen, focal = seen * scale, camera.intrinsics.focal / float(scale[1])
     if len(positions) < _MIN_POINTS:
-        return _Verified(candidate.rate, offset, scale, _TRUNCATION_PX**2, 0.0, False)
+        return _Verified(candidate.rate, offset, scale, _TRUNCATION_PX**2, 0.0, False, step)
     residual = _resected_residuals(positions, seen, positions, seen, focal)
     late = when > np.median(when)
     halves = (
@@ -323,7 +356,31 @@ def _verify(
     )
     predicts = all(float(np.median(one)) < _TRUNCATION_PX for one in halves)
     truncated = float((np.minimum(residual, _TRUNCATION_PX) ** 2).mean())
-    return _Verified(candidate.rate, offset, scale, truncated, float((residual < _TRUNCATION_PX).mean()), predicts)
+    inliers = float((residual < _TRUNCATION_PX).mean())
+    return _Verified(candidate.rate, offset, scale, truncated, inliers, predicts, step)
+
+
+def _verify_with_step(candidate: TimeMapCandidate, samples: list[_Sample], camera: CameraInput) -> list[_Verified]:
+    """The candidate with the clock step that fits best where either half of its rows gives pose and lag.
+
+    A step is in one of the halves; the other one, which it does not touch, is of the longer part.
+    """
+    times = np.concatenate([time for _, time, _ in samples])
+    image = np.concatenate([points for _, _, points in samples])
+    order, middle, out = np.argsort(times, kind="stable"), float(np.median(times)), []
+    for late in (False, True):
+        half = [(label, time[part], at[part]) for label, time, at in samples for part in [(time >= middle) == late]]
+        placed = _verify(candidate, half, camera)
+        if placed.inliers < _MIN_INLIERS:
+            continue
+        near = replace(candidate, offset=placed.offset)
+        pose, costs = _resect(*_common(half, near.rate, near.offset)[:2]), []
+        for size in STEP_SIZES:
+            moved = [label.path.at(near.rate * (time - size) + near.offset) for label, time, _ in samples]
+            residual = _reprojection(pose, np.concatenate(moved), image, camera.intrinsics.focal)
+            costs.append(np.minimum(residual, _TRUNCATION_PX)[order] ** 2)
+        out.append(_verify(near, samples, camera, step=_Step(*best_split(times[order], np.array(costs))[:3])))
+    return out
 
 
 def _misfit(verified: list[_Verified]) -> str:

@@ -39,13 +39,15 @@ from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
-from protocols.session.rig import Rig
+from protocols.session.rig import MAX_READOUT_S, Rig
 
 _SHORT_GAPS, _MAX_NOMINAL = 0.05, 4.0
 """Quantile of a camera's gaps between rows that stands for consecutive frames, and how much faster than those its
 nominal rate may be: a target seen in every fourth frame at best."""
 _MAX_Z = 2.0
 """Residuals over the detector's stds, or the reverse, from which these are reported as wrong."""
+_MAX_REJECTED = 0.2
+"""Share of a camera's rows that is left out without a warning: a detector is rarely wrong more often."""
 _MAX_SAMPLES = 4_000_000
 """Of one path: 4.6 hours at 240 Hz."""
 
@@ -174,6 +176,7 @@ def assemble_calibration(
         + _estimated_lenses(rig, cameras)
         + (refuted_lens_warnings(names, problem, state, refine_lenses) if published is None else ())
         + _other_frame_rates(rig, cameras, names[reference])
+        + _rejected_rows(names, problem, state)
         + _estimated_readouts(cameras)
         + _estimated_jitter(names, state, time_scales)
         + _clock_step_warnings(cameras)
@@ -269,13 +272,41 @@ def _unused_lengths(rig: Rig, names: list[str], labels: list[str]) -> tuple[str,
 def _other_frame_rates(rig: Rig, cameras: dict[str, CameraCalibration], reference: str) -> tuple[str, ...]:
     """One sentence for each camera whose clock rate no crystal explains."""
     out = []
+    common = float(np.median([camera.time_map.clock_rate for camera in cameras.values()])) if len(cameras) > 2 else 1.0
+    std = float(np.median([camera.clock_rate_std for camera in cameras.values()]))
+    # Where the others agree on another rate than the reference's, it is the reference that runs differently.
+    common, whom, whose = (
+        (common, "the others", "the others'") if _is_no_crystal(common, std) else (1.0, reference, f"{reference}'s")
+    )
     for name, camera in cameras.items():
-        rate, std, fps = camera.time_map.clock_rate, camera.clock_rate_std, rig.cameras[name].fps
-        if abs(rate - 1.0) < RATE_TOLERANCE and (rate - 1.0) ** 2 > REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + std**2):
+        rate, fps = camera.time_map.clock_rate / common, rig.cameras[name].fps
+        own = std if name == reference else camera.clock_rate_std
+        if _is_no_crystal(rate, own):
             out.append(
-                f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * std:.0f} ppm against {reference}'s, more "
+                f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * own:.0f} ppm against {whose}, more "
                 f"than the 100 ppm of crystals: a different frame rate, {fps / rate:.5g} fps for {fps:.5g}, or that of "
-                f"{reference}"
+                f"{whom}"
+            )
+    return tuple(out)
+
+
+def _is_no_crystal(rate: float, std: float) -> bool:
+    """Whether a relative clock rate, with its std, is one that no crystal explains."""
+    return abs(rate - 1.0) < RATE_TOLERANCE and (rate - 1.0) ** 2 > REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + std**2)
+
+
+def _rejected_rows(names: list[str], problem: Problem, state: AdjustmentState) -> tuple[str, ...]:
+    """One sentence for each camera many of whose rows were left out, though others saw the point then."""
+    out = []
+    for number, name in enumerate(names):
+        parts = [part for part in problem.rows if part.camera == number]
+        norms = [residual_norms(part, state.cameras[number], state.trajectories[part.label]) for part in parts]
+        seen = sum(int(np.isfinite(norm).sum()) for norm in norms)
+        left = sum(int((np.isfinite(norm) & ~part.use).sum()) for norm, part in zip(norms, parts, strict=True))
+        if left > _MAX_REJECTED * seen:
+            out.append(
+                f"{name}: {left} of its {seen} rows ({100 * left / seen:.0f} %) do not fit the others' path at its lag "
+                "and were left out: false detections, a moved camera, or a clock that is not even"
             )
     return tuple(out)
 
@@ -283,7 +314,7 @@ def _other_frame_rates(rig: Rig, cameras: dict[str, CameraCalibration], referenc
 def _readout(rig: Rig, name: str, found: float) -> float:
     """Readout time [s] from the first row to the last: as given, else as estimated; 0 if neither."""
     given = rig.cameras[name].readout
-    return found if given is None else given
+    return float(np.clip(found, -MAX_READOUT_S, MAX_READOUT_S)) if given is None else given
 
 
 def _estimated_readouts(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:

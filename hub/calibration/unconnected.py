@@ -36,7 +36,8 @@ def connect_by_resection(
     pairs: list[PairSolution] = []
     reasons: dict[str, str] = {}
     for name in names:
-        found, reasons[name] = find_time_map(prepared.cameras[name], reconstruction, RATES)
+        found, step = find_time_map(prepared.cameras[name], reconstruction, RATES)
+        reasons[name] = step
         if found is None:
             continue
         scaled = prepared
@@ -60,6 +61,8 @@ def connect_by_resection(
             continue
         trial = adjust(trial)
         reasons[name] = misfit(trial, name)
+        if step and trial.names.index(name) not in (one.camera for one in trial.state.clock_steps):
+            reasons[name] = f"{step}, but no step explains its rows ({reasons[name] or 'it fits without one'})"
         if not reasons[name]:
             del reasons[name]
             prepared, reconstruction = scaled, trial

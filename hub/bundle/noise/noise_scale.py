@@ -212,7 +212,7 @@ def _inflation_of(problem: Problem, state: AdjustmentState, camera: int) -> floa
     return frames * _serial_inflation(parts, frames)
 
 
-def score_inflation(problem: Problem, state: AdjustmentState, camera: int) -> float:
+def score_inflation(problem: Problem, state: AdjustmentState, camera: int, min_pairs: int = _MIN_PAIRS) -> float:
     """Rows per effective row in the score of a clock's offset: residuals times velocities.
 
     Where the motion turns from frame to frame, the residuals of a lasting time error do too, while these do not.
@@ -224,7 +224,7 @@ def score_inflation(problem: Problem, state: AdjustmentState, camera: int) -> fl
             score = (line.residual * line.camera_jacobian[:, :, OFFSET]).sum(axis=1)
             parts.append((rows.stamps[rows.use][line.valid], np.column_stack([score, score])[line.valid]))
     frames = _within_frame_inflation(parts)
-    return frames * _serial_inflation(parts, frames)
+    return frames * _serial_inflation(parts, frames, min_pairs)
 
 
 def _within_frame_inflation(parts: list[tuple[Floats, Floats]]) -> float:
@@ -246,7 +246,7 @@ def _within_frame_inflation(parts: list[tuple[Floats, Floats]]) -> float:
     return 1.0 + float((label_count * others).sum() / label_count.sum()) * correlation
 
 
-def _serial_inflation(parts: list[tuple[Floats, Floats]], frames: float = 1.0) -> float:
+def _serial_inflation(parts: list[tuple[Floats, Floats]], frames: float = 1.0, min_pairs: int = _MIN_PAIRS) -> float:
     """Inflation by autocorrelation over frames; parts: as above, in any order; frames: inflation within a frame."""
     parts = [
         (time[order], residual[order].T.copy())
@@ -266,7 +266,7 @@ def _serial_inflation(parts: list[tuple[Floats, Floats]], frames: float = 1.0) -
                 near = np.abs(time[lag:] - time[:-lag] - lag * step) < 0.5 * step
                 product += float(((residual[:, lag:] * residual[:, :-lag]) @ near).sum())
                 pairs += int(np.count_nonzero(near))
-        if pairs < _MIN_PAIRS:
+        if pairs < min_pairs:
             break
         correlation = 0.5 * product / pairs / variance
         if correlation < _SIGNIFICANCE_SIGMA * np.sqrt(frames / (2.0 * pairs)):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from hub.calibration.pipeline import calibrate
+from protocols.session.observations import Observations
 from tests.bench.clock_models import World, reported, session
 from tests.unit.hub.bundle.test_timestamp_jitter import jittery
 
@@ -39,6 +40,45 @@ def test_what_a_clock_does_is_reported_and_nothing_else(effect: str, world: Worl
         assert (said.jitter > 1e-4) == (true.jitter > 0.0)
         assert said.readout == pytest.approx(true.readout, abs=4.5 * said.readout_std)
         assert said.readout_std < 0.003
+
+
+SHORT = World(seconds=15.0, noise=1.0, fps=(10.0, 30.0, 15.0, 25.0), fastest=1.0, focal_error=0.0, labels=1)
+LONGER = replace(SHORT, seconds=30.0, noise=0.5, fps=(25.0, 30.0, 50.0))
+
+
+@pytest.mark.parametrize(
+    ("effect", "seed", "world"),
+    [
+        ("step60", 7003, SHORT),  # a false frame rate explained most of it
+        ("step60", 7001, SHORT),  # fitted at no lag
+        ("step100", 7001, LONGER),
+    ],
+)
+def test_a_clock_step_is_neither_a_frame_rate_nor_a_refused_camera(effect: str, seed: int, world: World) -> None:
+    rig, observations, clocks = session(seed, effect, world)
+    found = calibrate(rig, observations, thorough=True)
+    assert len(found.cameras) == len(clocks)
+    assert not any("frame rate" in text for text in found.warnings)
+    for name, camera in found.cameras.items():
+        assert len(camera.clock_steps) == len(clocks[name].steps)
+        for (at, size, _), (when, estimate, _) in zip(clocks[name].steps, camera.clock_steps, strict=True):
+            assert abs(when - at) < 0.2
+            assert abs(estimate - size) < 0.005
+
+
+def test_jitter_of_few_frames_is_no_step() -> None:
+    rig, observations, _ = session(9008, "jitters5", World(15.0, 0.5, (6.0, 10.0, 15.0, 10.0), 0.7, 0.01, 3))
+    assert not any(camera.clock_steps for camera in calibrate(rig, observations).cameras.values())
+
+
+def test_a_reference_that_runs_at_another_frame_rate_is_named_itself() -> None:
+    rig, observations, _ = session(7001, "none", USUAL)
+    late = {
+        key: replace(track, time=1.004 * track.time) if key[0] == "cam0" else track
+        for key, track in observations.tracks.items()
+    }
+    (said,) = [text for text in calibrate(rig, Observations(late)).warnings if "frame rate" in text]
+    assert said.startswith("cam0")
 
 
 @pytest.mark.parametrize("seed", [5125, 5126, 5129])

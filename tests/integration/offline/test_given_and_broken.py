@@ -12,7 +12,7 @@ import pytest
 from hub.bundle import model_comparison
 from hub.bundle.preprocessing import prepare
 from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations
-from hub.calibration import resection_scan
+from hub.calibration import resection_scan, result
 from hub.calibration.incremental import update_calibration
 from hub.calibration.pairs.pair_network import solve_pairs
 from hub.calibration.pipeline import calibrate, solve_network
@@ -146,6 +146,16 @@ def test_resection_tells_a_wrong_lens_and_a_mirrored_image_from_a_camera_that_sa
         found, reason = find_time_map(prepare(broken.rig, broken.observations()).cameras["cam3"], path, (1.0,))
         assert found is None
         assert words in reason
+
+
+def test_a_camera_many_of_whose_rows_are_left_out_is_named() -> None:
+    session = rigs.simulate(2, 3, 20.0)
+    prepared, pairs = solve_pairs(prepare(session.rig, session.observations()), lambda text, share: None)
+    solved = solve_network(prepared, pairs, lambda text, share: None).reconstruction
+    assert result._rejected_rows(solved.names, solved.problem, solved.state) == ()
+    rows = [part.using(part.use & (np.arange(len(part.use)) % 10 > 2 * part.camera)) for part in solved.problem.rows]
+    said = result._rejected_rows(solved.names, replace(solved.problem, rows=tuple(rows)), solved.state)
+    assert [text[:4] for text in said] == solved.names[1:]
 
 
 def test_candidates_at_other_frame_rates_do_not_displace_those_at_the_nominal_one(
@@ -294,6 +304,9 @@ def test_a_readout_is_neither_negative_nor_longer_than_a_frame(four: tuple[rigs.
     for readout, plausible in ((0.5 * interval, True), (-0.044, False), (1.5 * interval, False)):
         read = tuple(replace(camera, readout=readout) for camera in state.cameras)
         assert model_comparison.are_readouts_plausible(problem, replace(state, cameras=read)) == plausible
+    slow = replace(problem, rows=tuple(replace(part, time=10.0 * part.time) for part in rows))
+    read = tuple(replace(camera, readout=0.073) for camera in state.cameras)
+    assert not model_comparison.are_readouts_plausible(slow, replace(state, cameras=read))  # no rig.toml may say so
 
 
 def test_rallies_of_table_tennis_keep_all_cameras_and_invent_no_readout() -> None:
