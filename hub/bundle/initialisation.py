@@ -431,16 +431,22 @@ def _resect(
     sample = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_PNP_POINTS)).round().astype(np.int64)
     positions, seen = positions[sample], seen[sample]
     cv2.setRNGSeed(0)
-    found, rotation, translation, inliers = cv2.solvePnPRansac(
-        np.ascontiguousarray(positions),
-        np.ascontiguousarray(seen),
-        np.eye(3),
-        np.zeros(5),
-        iterationsCount=500,
-        reprojectionError=_PNP_THRESHOLD_PX / camera.intrinsics.focal,
-        confidence=0.9999,
-        flags=cv2.SOLVEPNP_SQPNP,
-    )
+    found, inliers = False, None
+    for method in (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP):
+        try:
+            found, rotation, translation, inliers = cv2.solvePnPRansac(
+                np.ascontiguousarray(positions),
+                np.ascontiguousarray(seen),
+                np.eye(3),
+                np.zeros(5),
+                iterationsCount=500,
+                reprojectionError=_PNP_THRESHOLD_PX / camera.intrinsics.focal,
+                confidence=0.9999,
+                flags=method,
+            )
+            break
+        except cv2.error:  # since OpenCV 5 the first one refuses a sample in one place, of a point that hovers
+            continue
     if not found or inliers is None or len(inliers) < max(_MIN_PNP_POINTS, 0.4 * len(sample)):
         return None
     rodrigues, shift = (np.asarray(vector, np.float64).ravel() for vector in (rotation, translation))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from hub.bundle import initialisation
 from hub.bundle.initialisation import _subsampled
+from hub.calibration.pipeline import calibrate
+from tests.support.rigs import simulate
 from tests.unit.hub.bundle.test_adjustment import simulated_problem
 
 
@@ -55,3 +59,19 @@ def test_a_path_is_triangulated_again_only_where_one_of_its_cameras_has_moved(mo
     assert made == ["x", "y", "y"]
     assert kept.path("x", {"a": replace(one, offset=one.offset + 1.0), "b": other}) == ("x", "a", "b")
     assert made == ["x", "y", "y", "x"]
+
+
+def test_a_sample_in_one_place_does_not_end_a_resection(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV 5 raises an error where the points that RANSAC draws lie in one place, as of a marker that hovers."""
+    solve, refused = cv2.solvePnPRansac, []
+
+    def degenerate(*arguments: Any, flags: int, **options: Any) -> Any:
+        if flags == cv2.SOLVEPNP_SQPNP:
+            refused.append(flags)
+            raise cv2.error("point_coordinate_variance >= POINT_VARIANCE_THRESHOLD")
+        return solve(*arguments, flags=flags, **options)
+
+    monkeypatch.setattr(cv2, "solvePnPRansac", degenerate)
+    session = simulate(3, 4, 20.0)
+    assert len(calibrate(session.rig, session.observations()).cameras) == 4
+    assert refused
