@@ -8,6 +8,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from queue import SimpleQueue
 from typing import Any, TypeAlias
 
 import zenoh
@@ -145,7 +146,8 @@ class ZenohSubscription(InboxSubscription):
         self._arrived: deque[Arrived] = deque()
         self._turn = threading.Lock()
         """Held while messages are taken from the channel or decoded: by turns, not alternately for each."""
-        self._backfill: Backfill[_Source] = Backfill(self._push, self._ask, self.inbox.count_lost)
+        self._questions: SimpleQueue[RecoveryQuery[_Source] | None] = SimpleQueue()
+        self._backfill: Backfill[_Source] = Backfill(self._push, self._questions.put, self.inbox.count_lost)
         self._newest: dict[tuple[str, _Source], int] = {}
         self._keys = _DeclaredKeys(session)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
@@ -159,6 +161,16 @@ class ZenohSubscription(InboxSubscription):
                 recovery=recovery if self._reliable else None,
             )
         threading.Thread(target=self._collect, args=(self._subscriber.handler,), name=f"bus {key}").start()
+        if self._reliable:
+            threading.Thread(target=self._recover, name=f"recovery {key}").start()
+
+    def _recover(self) -> None:
+        """Send the queries, until the subscription is closed.
+
+        In a thread of its own: a query waits for Zenoh's tables, which Zenoh holds while it waits for the channel.
+        """
+        while (question := self._questions.get()) is not None:
+            self._ask(question)
 
     def _collect(self, channel: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """Queue what arrives, until the subscription is closed.
@@ -275,6 +287,7 @@ class ZenohSubscription(InboxSubscription):
     def close(self) -> None:
         """Undeclare: a process with an open subscription never exits."""
         undeclare_all(self._subscriber)
+        self._questions.put(None)
         self._keys.close()
 
 
