@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -44,46 +45,48 @@ class CoverageAdvice:
 
 
 class CoverageMonitor:
-    """Counts detections of the target in the cells of each camera's image."""
+    """Notes detections of the target in the cells of each camera's image."""
 
     def __init__(self) -> None:
+        from protocols.messages import syncline_pb2 as pb  # a session folder needs no messages
+
+        self._observation, self._info = pb.Observation, pb.CameraInfo
         self._sizes: dict[str, tuple[int, int]] = {}
         self._targets: dict[str, str] = {}
-        self._counts: dict[str, np.ndarray[tuple[int, int], np.dtype[np.int64]]] = {}
+        self._cells: dict[str, bytearray] = {}
+        """1 of each cell in which the target was seen, row by row."""
         self._frames: dict[str, int] = {}
         self._rows: dict[str, int] = {}
 
     def handle(self, message: Message) -> None:
         """Add a CameraInfo or an Observation; other messages are ignored."""
-        from protocols.messages import syncline_pb2 as pb  # a session folder needs no messages
-
-        if isinstance(message, pb.CameraInfo):
+        if isinstance(message, self._info):
             self._sizes[message.camera] = (message.width, message.height)
             self._targets[message.camera] = message.target if message.target in VERBS else ANY
-            self._counts.setdefault(message.camera, np.zeros((ROWS, COLUMNS), dtype=np.int64))
-        elif isinstance(message, pb.Observation):
+            self._cells.setdefault(message.camera, bytearray(ROWS * COLUMNS))
+        elif isinstance(message, self._observation):
             name = message.camera
             self._frames[name] = self._frames.get(name, 0) + 1
             size = self._sizes.get(name)
-            if not message.detections or size is None:
+            if size is None or not (found := message.detections):
                 return
             self._rows[name] = self._rows.get(name, 0) + 1
-            best = max(message.detections, key=lambda one: one.score)
+            best = max(found, key=attrgetter("score")) if len(found) > 1 else found[0]
             column = min(max(int((best.u + 0.5) * COLUMNS / size[0]), 0), COLUMNS - 1)
             row = min(max(int((best.v + 0.5) * ROWS / size[1]), 0), ROWS - 1)
-            self._counts[name][row, column] += 1
+            self._cells[name][row * COLUMNS + column] = 1
 
     def reset(self) -> None:
-        """Clear the counts; the cameras stay known."""
-        for counts in self._counts.values():
-            counts[:] = 0
+        """Forget what was seen; the cameras stay known."""
+        for cells in self._cells.values():
+            cells[:] = bytes(len(cells))
         self._frames.clear()
         self._rows.clear()
 
     def covered_cells(self, camera: str) -> Bools:
         """(ROWS, COLUMNS): cells of a camera's image in which it saw the target."""
-        counts = self._counts.get(camera)
-        return np.zeros((ROWS, COLUMNS), dtype=np.bool_) if counts is None else np.asarray(counts > 0)
+        cells = self._cells.get(camera, bytes(ROWS * COLUMNS))
+        return np.frombuffer(bytes(cells), dtype=np.bool_).reshape(ROWS, COLUMNS)
 
     def coverage(self, camera: str) -> float:
         """Share of a camera's image in which it saw the target, 0..1."""

@@ -26,14 +26,15 @@ class ArrivalPriors:
 
     def handle(self, camera: str, boot_id: str, camera_time: float, arrival: float) -> None:
         """Add one frame: its time on the camera's clock and its arrival on the hub's [s]."""
-        boot, least = self._least.get(camera, (boot_id, {}))
-        if boot != boot_id or not least:
-            self._least[camera] = boot_id, (least := {})
-        interval = int(arrival // _INTERVAL_S)
-        delay = arrival - camera_time
-        least[interval] = min(least.get(interval, delay), delay)
-        if len(least) > _INTERVALS:
-            del least[min(least)]
+        known = self._least.get(camera)
+        if known is None or known[0] != boot_id:
+            known = self._least[camera] = boot_id, {}
+        least, interval, delay = known[1], int(arrival // _INTERVAL_S), arrival - camera_time
+        before = least.get(interval)
+        if before is None or delay < before:
+            least[interval] = delay
+            if len(least) > _INTERVALS:
+                del least[min(least)]
 
     def priors(self) -> dict[str, ExternalClockPrior]:
         """By camera, the hub's clock in place of Unix time."""

@@ -121,11 +121,11 @@ class ClockChangeDetector:
             if len(runs) >= _MAX_RUNS:
                 del self._clocks[runs[0]]
             clock = self._clocks[camera, boot] = _ClockState([(0, boot)])
-        if clock.last is not None and sequence <= clock.last[0]:
-            name = next((name for first, name in reversed(clock.segments) if first <= sequence), boot)
-            return name, None
         if clock.last is None:
             clock.origin_ns = device_ns
+        elif sequence <= clock.last[0]:
+            name = next((name for first, name in reversed(clock.segments) if first <= sequence), boot)
+            return name, None
         time = (device_ns - clock.origin_ns) * 1e-9  # Unix times in ns do not fit a float
         change = self._detect_step(clock, camera, sequence, frame, time, arrival)
         clock.last = (sequence, frame, time, arrival)

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protocols.core.clocks import NANOSECONDS, CameraTime
+from protocols.core.clocks import CameraTime
 from protocols.core.ranges import MAX_TIME_S
 from protocols.session.calibration import Calibration
 
@@ -39,19 +39,15 @@ class ExternalClockPrior:
 
 
 class ExternalClockPriors:
-    """The latest prior of each camera, and the time of its latest observation."""
+    """The latest prior of each camera."""
 
     def __init__(self) -> None:
         self._priors: dict[str, ExternalClockPrior] = {}
-        self._now: dict[str, float] = {}
+        self.times: dict[str, float] = {}
+        """By camera, the time [s] of its latest observation on its clock."""
 
-    def handle(self, message: pb.Observation | pb.AgentStatus) -> None:
-        """Add a camera agent's status (its prior), or an observation (its time)."""
-        from protocols.messages import syncline_pb2 as pb  # sessions from files need no protobuf
-
-        if isinstance(message, pb.Observation):
-            self._now[message.camera] = message.device_time_ns / NANOSECONDS
-            return
+    def handle(self, message: pb.AgentStatus) -> None:
+        """Add a camera agent's status: its prior."""
         if message.role != "camera":
             return
         gauges = message.gauges
@@ -71,11 +67,11 @@ class ExternalClockPriors:
         Of two cameras it cannot be decided which one is wrong; of more, those that differ from the median are reported.
         """
         valid = self.for_boots(boots)
-        priors = {name: valid[name] for name in calibration.cameras if name in valid and name in self._now}
+        priors = {name: valid[name] for name in calibration.cameras if name in valid and name in self.times}
         if len(priors) < 2:
             return []
         first = next(iter(priors))
-        unix = self._now[first] + priors[first].unix_minus_camera
+        unix = self.times[first] + priors[first].unix_minus_camera
         # One Unix time on the reference clock by each camera's prior and time map: equal if all are consistent.
         reference_times = {
             name: float(

@@ -58,13 +58,13 @@ class ObservationStream:
 
         arrival: on the hub's clock [s], None = unknown. backlog: it waited, so that its arrival says little.
         """
-        self.clock_priors.handle(message)
+        time = self.clock_priors.times[message.camera] = message.device_time_ns / NANOSECONDS
         message, change = self.clocks.assign(message, None if backlog else arrival)
         if change is not None:
             self.marker.require_rows(change.segment, SEGMENT_MIN_ROWS)
             self._rate_changes.handle(change)
         if arrival is not None and not backlog:
-            self._arrivals.handle(message.camera, message.boot_id, message.device_time_ns / NANOSECONDS, arrival)
+            self._arrivals.handle(message.camera, message.boot_id, time, arrival)
         return message, change
 
     def store(
@@ -76,12 +76,12 @@ class ObservationStream:
         """
         if isinstance(message, pb.CameraInfo):
             self._infos[message.camera] = message
-        if isinstance(message, pb.Observation) and any(d.kind and tracked_kind(d) for d in message.detections):
+        if isinstance(message, pb.Observation) and any(map(tracked_kind, message.detections)):
             if admits_people is None or admits_people(message):
                 self.people.handle(message)
             message = without_tracked(message)
         self.marker.handle(message, now)
-        if isinstance(message, pb.Observation):
+        if isinstance(message, pb.Observation) and self._rate_changes.cameras:
             self._extend_old_segment(message, now)
         return message
 

@@ -29,19 +29,20 @@ class ClockSegments:
 
     def assign(self, message: pb.Observation, arrival: float | None) -> tuple[pb.Observation, ClockChange | None]:
         """The observation with its clock segment as boot id, and the clock change that begins with it, if any."""
-        if self._changes[message.camera] >= _MAX_CHANGES:
+        camera, boot = message.camera, message.boot_id
+        if self._changes.get(camera, 0) >= _MAX_CHANGES:
             return message, None
         segment, change = self._detector.handle(
-            message.camera, message.boot_id, message.sequence, message.frame, message.device_time_ns, arrival
+            camera, boot, message.sequence, message.frame, message.device_time_ns, arrival
         )
-        self._runs[message.camera] = message.boot_id
+        self._runs[camera] = boot
         if change is not None:
-            self._changes[message.camera] += 1
+            self._changes[camera] += 1
         if change is not None and len(self.alarms) < _MAX_ALARMS:
             step, ppm = f"stepped by {change.step_s:+.3f} s", f"drifts {1e6 * change.rate_change:+.0f} ppm"
             text = step if change.kind == "step" else ppm
             self.alarms[change.camera] = f"the clock of {change.camera} {text}"
-        if segment == message.boot_id:
+        if segment == boot:
             return message, change
         relabelled = pb.Observation()
         relabelled.CopyFrom(message)

@@ -34,10 +34,12 @@ class _Bucket:
     time: float | None = None
 
     def refill(self, time: float) -> None:
-        if self.time is not None and time > self.time:
-            self.tokens = min(self.burst, self.tokens + (time - self.time) * self.rate)
+        last = self.time
+        if last is not None and time > last:
+            tokens = self.tokens + (time - last) * self.rate
+            self.tokens = tokens if tokens < self.burst else self.burst
         # Frames may arrive out of order; a clock that was set back begins anew.
-        if self.time is None or not self.time - _REORDERED_S < time < self.time:
+        if last is None or not last - _REORDERED_S < time < last:
             self.time = time
 
     def take(self, cost: float) -> bool:
@@ -74,19 +76,22 @@ class CameraBudgets:
         budget = self._of(message.camera)
         if budget is None:
             return None
+        hub, own = budget.hub, budget.own
         if budget.boot != message.boot_id:
             # A new clock; on the hub's clock a camera that restarts has no more than before.
-            budget.boot, budget.own.time = message.boot_id, None
-        cost = 1.0 + len(message.detections)
-        budget.hub.refill(now)
-        budget.own.refill(message.device_time_ns / NANOSECONDS)
-        if min(budget.hub.tokens, budget.own.tokens) < cost:
+            budget.boot, own.time = message.boot_id, None
+        count = len(message.detections)
+        cost = 1.0 + count
+        if hub.time != now:
+            hub.refill(now)
+        own.refill(message.device_time_ns / NANOSECONDS)
+        if hub.tokens < cost or own.tokens < cost:
             self.counts[message.camera] += 1
             self.when[message.camera] = now
             return None
-        budget.hub.take(cost)
-        budget.own.take(cost)
-        if len(message.detections) <= _MAX_DETECTIONS:
+        hub.tokens -= cost
+        own.tokens -= cost
+        if count <= _MAX_DETECTIONS:
             return message
         best = sorted(range(len(message.detections)), key=lambda index: -message.detections[index].score)
         copy = pb.Observation()

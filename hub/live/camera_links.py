@@ -35,13 +35,13 @@ class CameraLinks:
 
     def receive(self, message: pb.Observation, now: float, arrival: float | None, *, backlog: bool) -> None:
         """Note a frame; arguments as of ``LiveHub.handle``."""
+        camera = message.camera
         if arrival is not None:
-            camera_time = message.device_time_ns / NANOSECONDS
+            camera_time = self.camera_time[camera] = message.device_time_ns / NANOSECONDS
             if not backlog:
-                self.fresh.add(message.camera)
-            self.delays[message.camera] = arrival - camera_time
-            self.camera_time[message.camera] = camera_time
-        self.last_frame[message.camera] = now
+                self.fresh.add(camera)
+            self.delays[camera] = arrival - camera_time
+        self.last_frame[camera] = now
 
     def ages(self, now: float, kept: Iterable[str]) -> dict[str, float]:
         """Seconds since the last frame of each camera of ``kept`` or heard of lately."""
@@ -50,7 +50,7 @@ class CameraLinks:
 
     def is_left_out(self, message: pb.Observation | pb.CameraInfo) -> bool:
         """Whether this run of the camera's agent has caused too many errors."""
-        return self._muted.get(message.camera) == message.boot_id
+        return bool(self._muted) and self._muted.get(message.camera) == message.boot_id
 
     def record_fault(self, message: Message, error: Exception) -> None:
         """Count an error that a message raised; after some of them its camera is left out."""

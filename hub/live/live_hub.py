@@ -140,18 +140,18 @@ class LiveHub:
         arrival says little about its camera's clock. Whatever a camera sends costs that camera: an error in it is
         counted, and after some of them its messages are left out until its agent is restarted.
         """
-        if isinstance(message, pb.Observation | pb.CameraInfo):
-            if self.links.is_left_out(message):
-                return
-            if not self.budgets.admits_camera(message.camera):
-                self.counters["too_many_cameras"] += 1
-                return
+        if isinstance(message, pb.Observation | pb.CameraInfo) and self.links.is_left_out(message):
+            return
         if isinstance(message, pb.Observation):
             admitted = self.budgets.admit(message, self._now)
             if admitted is None:
-                self.counters["over_budget"] += 1
+                room = self.budgets.admits_camera(message.camera)
+                self.counters["over_budget" if room else "too_many_cameras"] += 1
                 return
             message = admitted
+        elif isinstance(message, pb.CameraInfo) and not self.budgets.admits_camera(message.camera):
+            self.counters["too_many_cameras"] += 1
+            return
         try:
             self._handle(message, arrival, backlog)
         except Exception as error:  # noqa: BLE001 - of whatever kind it is, it must not cost the other cameras
@@ -169,11 +169,11 @@ class LiveHub:
                 self._clock_stepped = True
             self.links.receive(message, self._now, arrival, backlog=backlog)
         self.guidance.handle(message)
+        stored = self.stream.store(message, self._now, self._admits_people)
         if self.tracking is not None:
-            self.tracking.handle(message)
-        message = self.stream.store(message, self._now, self._admits_people)
+            self.tracking.handle(message, stored is not message)
         if self.nodes is not None:
-            self.nodes.handle(message)
+            self.nodes.handle(stored)
         if isinstance(message, pb.Observation):
             self._received += 1
             self.counters["observations"] += 1

@@ -173,9 +173,10 @@ def frame_detections(
 
 def tracked_kind(detection: pb.Detection) -> str:
     """The kind under which a detection is tracked; "" for a labelled marker or corner: its label identifies it."""
-    if detection.kind in ("marker", "corner"):
+    kind: str = detection.kind
+    if kind == "marker" or kind == "corner":  # noqa: PLR1714 - of each detection: a tuple takes longer
         return "" if detection.label else "marker"
-    return str(detection.kind)
+    return kind
 
 
 def _covariance(detection: pb.Detection) -> Floats:

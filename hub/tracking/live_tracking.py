@@ -122,13 +122,13 @@ class LiveTracking:
         self.markers.calibrate(new, change)
         self._set_parameters(up if up is not None else self._estimated_up())
 
-    def handle(self, message: Message) -> None:
-        """Process one observation; other messages are ignored."""
+    def handle(self, message: Message, tracked: bool | None = None) -> None:
+        """Process one observation; other messages are ignored. tracked: whether some of it has no label of its own."""
         if not isinstance(message, pb.Observation):
             return
         self.markers.handle(message)
         if not self.has_detections:
-            self.has_detections = any(tracked_kind(detection) for detection in message.detections)
+            self.has_detections = any(map(tracked_kind, message.detections)) if tracked is None else tracked
             if not self.has_detections:
                 return
         if not self.tracker.cameras:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from array import array
+import struct
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats, Ints
+from protocols.geometry.types import Bools, Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_columns
 from protocols.session.rig import Rig, RigCamera
@@ -44,40 +45,20 @@ MIN_ROWS_AFTER_RESTART = 90
 """Detections from which on the new clock of a restarted camera is used."""
 
 
-@dataclass(slots=True, eq=False)
-class _Columns:
-    """Detections in order of arrival, column by column: a snapshot of 20,000 rows is taken in milliseconds.
-
-    chunk: number of the interval of arrival; label: index into the builder's labels.
-    """
-
-    time_ns: array[int] = field(default_factory=lambda: array("q"))
-    frame: array[int] = field(default_factory=lambda: array("Q"))
-    sequence: array[int] = field(default_factory=lambda: array("Q"))
-    chunk: array[int] = field(default_factory=lambda: array("q"))
-    label: array[int] = field(default_factory=lambda: array("q"))
-    values: array[float] = field(default_factory=lambda: array("d"))  # u, v, size, std
-
-    def __len__(self) -> int:
-        return len(self.time_ns)
-
-    def take(self, keep: Ints) -> None:
-        """Keep only the rows of these indices."""
-        values = np.frombuffer(self.values).reshape(-1, 4)[keep]
-        for name in ("time_ns", "frame", "sequence", "chunk", "label"):
-            column = getattr(self, name)
-            setattr(self, name, array(column.typecode, np.array(column)[keep].tobytes()))
-        self.values = array("d", values.tobytes())
+_ROW = np.dtype("i8, i8, i8, i4, i4, f8, f8, f8, f8")
+_ROW.names = ("time_ns", "frame", "sequence", "chunk", "label", "u", "v", "size", "std")
+_pack_row = struct.Struct("=qqqiidddd").pack
+"""A detection; chunk: number of the interval of arrival; label: index into the builder's labels."""
 
 
 @dataclass(slots=True, eq=False)
 class _BootBuffer:
     """The observations of one boot of one camera's agent, which has one clock.
 
-    last: by label, u and v. room: a chunk, and how many rows of it are still taken.
+    rows: packed, in order of arrival: it is appended to in one step. last: by label, u and v. room: a chunk, and how many rows of it are still taken.
     """
 
-    rows: _Columns = field(default_factory=_Columns)
+    rows: bytearray = field(default_factory=bytearray)
     last: dict[int, tuple[float, float]] = field(default_factory=dict)
     room: tuple[int, int] = (-1, 0)
     frames: int = 0
@@ -85,6 +66,17 @@ class _BootBuffer:
     highest: int = -1
     ring: bytearray | None = None
     """Bit ``sequence % _REMEMBERED``: received, for the last so many sequence numbers up to the highest."""
+
+    def __len__(self) -> int:
+        return len(self.rows) // _ROW.itemsize
+
+    def table(self) -> Any:
+        """A copy of the rows, as an array of ``_ROW``: nothing may be appended to what an array looks at."""
+        return np.frombuffer(bytes(self.rows), dtype=_ROW)
+
+    def take(self, keep: Ints | Bools) -> None:
+        """Keep only these rows."""
+        self.rows = bytearray(self.table()[keep].tobytes())
 
     def is_duplicate(self, sequence: int) -> bool:
         """Whether the sequence number was received before; marks it as received. Remembers all of them."""
@@ -104,7 +96,7 @@ class _BootBuffer:
             return True
         if ahead >= _DUPLICATE_WINDOW:
             self.ring[:] = bytes(_DUPLICATE_WINDOW // 8)
-        else:
+        elif ahead != 1:
             for between in range(self.highest + 1, sequence):
                 self.ring[between % _DUPLICATE_WINDOW >> 3] &= ~(1 << (between & 7))
         self.highest = max(self.highest, sequence)
@@ -112,6 +104,9 @@ class _BootBuffer:
         known = ahead <= 0 and bool(self.ring[byte] & bit)
         self.ring[byte] |= bit
         return known
+
+
+_score = attrgetter("score")
 
 
 class SessionBuilder:
@@ -131,7 +126,7 @@ class SessionBuilder:
         self._boots: dict[str, dict[str, _BootBuffer]] = {}
         self._settled: dict[str, int] = {}
         self._labels: dict[str, int] = {}
-        self._labels_of: dict[str, set[str]] = {}
+        self._labels_of: dict[str, dict[str, int]] = {}
         self._since: dict[tuple[str, str], int] = {}
         self._selection: dict[str, list[tuple[str, int, int]]] | None = None
         self.counters: Counter[str] = Counter()
@@ -163,7 +158,7 @@ class SessionBuilder:
 
     def rows(self, camera: str) -> int:
         """Detections held of a camera, over all its boots."""
-        return sum(len(boot.rows) for boot in self._boots.get(camera, {}).values())
+        return sum(len(boot) for boot in self._boots.get(camera, {}).values())
 
     def frames(self, camera: str) -> int:
         """Frames received of a camera, also those without a detection."""
@@ -182,9 +177,9 @@ class SessionBuilder:
         boots = self._boots.get(camera, {})
         if self._chunks is not None:
             for boot in reversed(boots):
-                if len(boots[boot].rows) >= self._settled.get(boot, MIN_ROWS_AFTER_RESTART):
+                if len(boots[boot]) >= self._settled.get(boot, MIN_ROWS_AFTER_RESTART):
                     return boot
-        return max(sorted(boots), key=lambda boot: len(boots[boot].rows), default="")
+        return max(sorted(boots), key=lambda boot: len(boots[boot]), default="")
 
     def require_rows(self, boot: str, rows: int) -> None:
         """Use a boot only once it has so many detections; until then the boot before it is used."""
@@ -196,7 +191,7 @@ class SessionBuilder:
         warnings = []
         for camera in sorted(self._boots):
             kept = self.boot(camera)
-            lost = sum(len(boot.rows) for name, boot in self._boots[camera].items() if name != kept)
+            lost = sum(len(boot) for name, boot in self._boots[camera].items() if name != kept)
             if lost:
                 warnings.append(
                     f"{camera} was restarted, which begins a new clock: {lost} detections of other boots left out"
@@ -213,11 +208,7 @@ class SessionBuilder:
         if not names:
             raise Refused("no camera has seen anything yet")
         taken = [(rows, used) for rows, used in parts if len(used)]
-        values = np.concatenate([np.array(rows.values).reshape(-1, 4)[used] for rows, used in taken])
-
-        def column(name: str) -> Ints:
-            return np.concatenate([np.array(getattr(rows, name))[used] for rows, used in taken]).astype(np.int64)
-
+        table = np.concatenate([rows[used] for rows, used in taken])
         labels = sorted(self._labels)
         place = {label: number for number, label in enumerate(labels)}
         rank = np.array([place[label] for label in self._labels], dtype=np.int64)
@@ -225,12 +216,12 @@ class SessionBuilder:
             names,
             labels,
             np.repeat(np.arange(len(names)), [len(used) for _, used in taken]),
-            rank[column("label")],
-            column("frame"),
-            column("time_ns") / NANOSECONDS,
-            np.ascontiguousarray(values[:, :2]),
-            np.where(values[:, 2] > 0, values[:, 2], np.nan),
-            stds=np.where(values[:, 3] > 0, values[:, 3], np.nan),
+            rank[table["label"]],
+            np.ascontiguousarray(table["frame"]),
+            table["time_ns"] / NANOSECONDS,
+            np.column_stack([table["u"], table["v"]]),
+            np.where(table["size"] > 0, table["size"], np.nan),
+            stds=np.where(table["std"] > 0, table["std"], np.nan),
             frames_may_repeat=True,
         )
         return self._build_rig(order), observations
@@ -245,7 +236,7 @@ class SessionBuilder:
             rows, used = self._used(camera)
             if not len(used):
                 continue
-            chunk, sequence = np.array(rows.chunk)[used], np.array(rows.sequence, dtype=np.int64)[used]
+            chunk, sequence = rows["chunk"][used], rows["sequence"][used]
             ends = np.flatnonzero([(one + 1 not in self._motion) for one in np.unique(chunk)])
             last = np.unique(chunk)[ends]
             run = np.searchsorted(last, chunk)
@@ -260,84 +251,95 @@ class SessionBuilder:
         for camera, boot, first, last in ranges:
             self._selection.setdefault(camera, []).append((boot, first, last))
 
-    def _used(self, camera: str) -> tuple[_Columns, Ints]:
+    def _used(self, camera: str) -> tuple[Any, Ints]:
         """A camera's rows, and the indices of those that are used: one a time and label."""
         boots = self._boots.get(camera)
+        nothing = np.zeros(0, dtype=_ROW), np.zeros(0, dtype=np.int64)
         if not boots:
-            return _Columns(), np.zeros(0, dtype=np.int64)
+            return nothing
         if self._selection is not None:
             runs = [run for run in self._selection.get(camera, []) if run[0] in boots]
             if not runs:
-                return _Columns(), np.zeros(0, dtype=np.int64)
-            rows = boots[runs[0][0]].rows
-            sequence = np.array(rows.sequence, dtype=np.int64)
+                return nothing
+            rows = boots[runs[0][0]].table()
+            sequence = rows["sequence"]
             inside = np.zeros(len(sequence), dtype=np.bool_)
             for _, begin, end in runs:
                 inside |= (sequence >= begin) & (sequence <= end)
             return rows, self._one_a_time(rows, np.flatnonzero(inside))
-        rows = boots[self.boot(camera)].rows
-        used = np.flatnonzero(np.array(rows.time_ns) >= self._since.get((camera, self.boot(camera)), -(2**63)))
+        rows = boots[self.boot(camera)].table()
+        used = np.flatnonzero(rows["time_ns"] >= self._since.get((camera, self.boot(camera)), -(2**63)))
         return rows, self._one_a_time(rows, used)
 
     @staticmethod
-    def _one_a_time(rows: _Columns, used: Ints) -> Ints:
+    def _one_a_time(rows: Any, used: Ints) -> Ints:
         """Of two rows of one time and label the first: a camera's fault that must not cost the others their answer."""
-        time, label = np.array(rows.time_ns)[used], np.array(rows.label)[used]
+        time, label = rows["time_ns"][used], rows["label"][used]
         order = np.lexsort((used, time, label))
         repeated = (np.diff(time[order]) == 0) & (np.diff(label[order]) == 0)
         return np.sort(used[order[np.concatenate([[True], ~repeated])]]) if len(used) else used
 
     def _observe(self, message: pb.Observation, moment: float) -> None:
-        boots = self._boots.setdefault(message.camera, {})
+        camera, sequence = message.camera, message.sequence
+        boots = self._boots.get(camera)
+        if boots is None:
+            boots, self._labels_of[camera] = self._boots.setdefault(camera, {}), {}
         boot = boots.get(message.boot_id)
         if boot is None:
-            self._forget_a_boot(message.camera)
+            self._forget_a_boot(camera)
             boot = boots[message.boot_id] = _BootBuffer()
         known = boot.is_duplicate if self._chunks is None else boot.is_recent_duplicate
-        if known(message.sequence):
+        if known(sequence):
             self.counters["duplicates"] += 1
             return
         boot.frames += 1
         chunk = self._advance(moment)
+        detections = list(message.detections)
         if self._chunks is not None:
             room = boot.room[1] if boot.room[0] == chunk else _MAX_CHUNK_ROWS
-            boot.room = chunk, room - len(message.detections)
+            boot.room = chunk, room - len(detections)
             if boot.room[1] < 0:
                 self.counters["flooded"] += 1
                 return
-        labels: set[str] = set()
         # One row per label and frame: of several detections the one of the highest score is used.
-        for detection in sorted(message.detections, key=lambda found: -found.score):
+        if len(detections) > 1:
+            detections.sort(key=_score, reverse=True)
+        rows, stamps = boot.rows, (message.device_time_ns, message.frame, sequence, chunk)
+        labels, known_labels = set[int](), self._labels_of[camera]
+        moved = self._motion.get(chunk)
+        for detection in detections:
             label = detection.label or DEFAULT_LABEL
-            if label in labels:
-                self.counters["second_detections"] += 1
-                continue
-            labels.add(label)
-            own = self._labels_of.setdefault(message.camera, set())
-            if label not in own and len(own) >= _MAX_LABELS:
+            index = known_labels.get(label)
+            if index is None and (index := self._introduced(camera, label)) is None:
                 self.counters["too_many_labels"] += 1
                 continue
-            own.add(label)
-            index = self._labels.setdefault(label, len(self._labels))
-            rows = boot.rows
-            rows.time_ns.append(message.device_time_ns)
-            rows.frame.append(message.frame)
-            rows.sequence.append(message.sequence)
-            rows.chunk.append(chunk)
-            rows.label.append(index)
-            rows.values.extend((detection.u, detection.v, detection.size, _std(detection)))
-            if chunk in self._motion:
-                u, v = boot.last.get(index, (detection.u, detection.v))
-                boot.last[index] = detection.u, detection.v
-                moved = self._motion[chunk]
-                step = min(math.hypot(detection.u - u, detection.v - v), _MAX_STEP_PX)
-                moved[message.camera] = moved.get(message.camera, 0.0) + step
+            if index in labels:
+                self.counters["second_detections"] += 1
+                continue
+            labels.add(index)
+            at = detection.u, detection.v
+            std, covariance = 0.0, detection.covariance
+            if covariance:  # of one coordinate [px]
+                std = math.sqrt(max(0.5 * (covariance[0] + covariance[2]), 0.0))
+            rows += _pack_row(*stamps, index, *at, detection.size, std)
+            if moved is not None:
+                step = min(math.dist(at, boot.last.get(index, at)), _MAX_STEP_PX)
+                boot.last[index] = at
+                moved[camera] = moved.get(camera, 0.0) + step
+
+    def _introduced(self, camera: str, label: str) -> int | None:
+        """The index of a camera's new label; None where it has too many."""
+        own = self._labels_of[camera]
+        if len(own) >= _MAX_LABELS:
+            return None
+        own[label] = self._labels.setdefault(label, len(self._labels))
+        return own[label]
 
     def _advance(self, moment: float) -> int:
         """The chunk of a moment; a new one may replace the one with the least motion."""
         if self._chunks is None:
             return 0
-        chunk = max(math.floor(moment / CHUNK_S), self._chunk)
+        chunk = max(int(moment // CHUNK_S), self._chunk)
         if chunk > self._chunk or not self._motion:
             self._chunk = chunk
             self._motion[chunk] = {}
@@ -349,9 +351,9 @@ class SessionBuilder:
                 del self._motion[dropped]
                 for boots in self._boots.values():
                     for boot in boots.values():
-                        kept = np.flatnonzero(np.array(boot.rows.chunk, dtype=np.int64) != dropped)
-                        if len(kept) < len(boot.rows):
-                            boot.rows.take(kept)
+                        kept = boot.table()["chunk"] != dropped
+                        if not kept.all():
+                            boot.take(kept)
             self._drop_excess()
         return chunk
 
@@ -361,9 +363,9 @@ class SessionBuilder:
         excess = sum(held.values()) - _MAX_ROWS
         while excess > 0:
             camera = max(held, key=lambda name: held[name])
-            boot = max(self._boots[camera].values(), key=lambda one: len(one.rows))
-            drop = min(excess, max(len(boot.rows) // 2, 1))
-            boot.rows.take(np.arange(drop, len(boot.rows)))
+            boot = max(self._boots[camera].values(), key=lambda one: len(one))
+            drop = min(excess, max(len(boot) // 2, 1))
+            boot.take(np.arange(drop, len(boot)))
             held[camera] -= drop
             excess -= drop
             self.counters["excess_rows"] += drop
@@ -374,7 +376,7 @@ class SessionBuilder:
         if self._chunks is None or len(boots) < _MAX_BOOTS:
             return
         used = self.boot(camera)
-        least = min((name for name in boots if name != used), key=lambda name: len(boots[name].rows))
+        least = min((name for name in boots if name != used), key=lambda name: len(boots[name]))
         del boots[least]
         self._settled.pop(least, None)
         self._since.pop((camera, least), None)
@@ -426,13 +428,6 @@ def rig_camera_from_info(info: pb.CameraInfo) -> RigCamera:
         position_std=_vector(info.position_std),
         rotation_std=_vector(info.rotation_std),
         table={"name": info.camera, "size": [info.width, info.height], "fps": info.fps},
-    )
-
-
-def _std(detection: pb.Detection) -> float:
-    """Std of one coordinate [px] by the detector's covariance; 0 without one."""
-    return (
-        math.sqrt(max(0.5 * (detection.covariance[0] + detection.covariance[2]), 0.0)) if detection.covariance else 0.0
     )
 
 
