@@ -55,7 +55,7 @@ class Topic:
 
 
 OBSERVATION = Topic("observation", "camera/{id}/observation", "Observation", 30.0, True, Delivery.RELIABLE, 65_536, 2.0)
-CAMERA_INFO = Topic("camera_info", "camera/{id}/info", "CameraInfo", 0.5, True, Delivery.LATEST, 256, 10.0)
+CAMERA_INFO = Topic("camera_info", "camera/{id}/info", "CameraInfo", 0.5, True, Delivery.LATEST, 2048, 10.0)
 RIG_INFO = Topic("rig_info", "hub/{id}/rig", "RigInfo", 0.1, True, Delivery.LATEST, 16, 60.0)
 CALIBRATION = Topic("calibration", "hub/{id}/calibration", "Calibration", 0.5, True, Delivery.LATEST, 64, 0.0)
 TRACK = Topic("track", "hub/{id}/track", "Track", 30.0, True, Delivery.RELIABLE, 4096, 0.0)

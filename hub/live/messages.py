@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from hub.live.solver import SolverAnswer, SolverJob
 from protocols.core.clocks import NANOSECONDS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, TrajectoryTable
+from protocols.validation.codec import MAX_PAYLOAD
+from protocols.validation.rules import MAX_TEXT
 
 SCHEMA_VERSION = 1  # of the messages
 
@@ -45,15 +47,21 @@ def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[
                 clock_rate_std=camera.clock_rate_std,
             )
         )
-    message.refused.extend(pb.Refusal(camera=name, reason=reason) for name, reason in calibration.refused.items())
+    message.refused.extend(_refusals(calibration.refused))
     return message
 
 
 def refusal_message(reason: str, cameras: dict[str, str], revision: int, status: str) -> pb.Calibration:
     """The message of no calibration. status: "refused" or "collecting"; reason: what is missing."""
-    message = pb.Calibration(schema_version=SCHEMA_VERSION, revision=revision, status=status, reason=reason)
-    message.refused.extend(pb.Refusal(camera=name, reason=why) for name, why in cameras.items())
+    message = pb.Calibration(schema_version=SCHEMA_VERSION, revision=revision, status=status, reason=reason[:MAX_TEXT])
+    message.refused.extend(_refusals(cameras))
     return message
+
+
+def _refusals(reasons: Mapping[str, str]) -> list[pb.Refusal]:
+    """Of a thousand cameras, each with a dozen pairs that failed, the beginning of each reason."""
+    room = min(MAX_TEXT, MAX_PAYLOAD // 3 // max(len(reasons), 1))
+    return [pb.Refusal(camera=name, reason=reason[:room]) for name, reason in reasons.items()]
 
 
 def solver_event(
@@ -76,7 +84,7 @@ def solver_event(
                 for name, prior in priors.items()
             )
     if answer is not None:
-        message.reason, message.cpu_s = answer.reason, answer.cpu_s
+        message.reason, message.cpu_s = answer.reason[:MAX_TEXT], answer.cpu_s
     return message
 
 
