@@ -43,14 +43,9 @@ class _Bucket:
             self.time = time
 
     def take(self, cost: float) -> bool:
-        if cost > self.tokens:
-            return False
-        self.tokens -= cost
-        return True
-
-
-def _bucket(rate: float, burst: float) -> _Bucket:
-    return _Bucket(rate, burst, burst)
+        taken = cost <= self.tokens
+        self.tokens -= cost if taken else 0.0
+        return taken
 
 
 @dataclass(slots=True)
@@ -58,9 +53,9 @@ class _CameraBudget:
     """boot: whose clock ``own`` and ``people`` are on."""
 
     boot: str = ""
-    hub: _Bucket = field(default_factory=lambda: _bucket(_ROWS_PER_S, _BURST_ROWS))
-    own: _Bucket = field(default_factory=lambda: _bucket(_ROWS_PER_S, _BURST_ROWS))
-    people: _Bucket = field(default_factory=lambda: _bucket(_PEOPLE_PER_S, 2.0 * _PEOPLE_PER_S))
+    hub: _Bucket = field(default_factory=lambda: _Bucket(_ROWS_PER_S, _BURST_ROWS, _BURST_ROWS))
+    own: _Bucket = field(default_factory=lambda: _Bucket(_ROWS_PER_S, _BURST_ROWS, _BURST_ROWS))
+    people: _Bucket = field(default_factory=lambda: _Bucket(_PEOPLE_PER_S, 2.0 * _PEOPLE_PER_S, 2.0 * _PEOPLE_PER_S))
 
 
 class CameraBudgets:

@@ -79,7 +79,7 @@ class FairShare:
             self._trim()
 
     def _trim(self) -> None:
-        """Drop a tenth of all that waits, one at a time of who has most: with a thousand to look for each takes 50 µs."""
+        """Drop a tenth of all that waits, each time of who has most: to find out among a thousand takes 50 µs."""
         most = [(-rows, sender) for sender, rows in self._rows.items()]
         heapify(most)
         while self._in_all > 0.9 * _MAX_WAITING_IN_ALL:

@@ -30,7 +30,7 @@ from hub.tracking.live_tracking import LiveTracking
 from protocols.core.errors import InputError, Refused
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.builder import SessionBuilder
+from protocols.session.builder import LONG_FILM_S, SessionBuilder
 from protocols.session.calibration import Calibration, CameraCalibration, stated_calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -39,6 +39,8 @@ HubState = Literal["collecting", "searching", "calibrated", "degraded", "refused
 
 _MIN_PEOPLE_S = 40.0
 """Total duration of people's tracklets [s] that two cameras need before people-based calibration is tried."""
+_FILM_PER_CAMERA_S = 0.1
+"""Film [s] that each camera adds to what the first job needs: its share of that job's CPU, 0.08 to 0.13 s."""
 _BEHIND_S = 10.0
 """A job that takes longer than this degrades a calibrated hub: warm ones take about a second."""
 SILENT_S = 3.0
@@ -224,6 +226,9 @@ class LiveHub:
             return f"{len(cameras)} of at least 2 cameras heard of"
         rows_by_camera = {name: self.stream.marker.rows(name) for name in cameras}
         ready = [name for name, rows in rows_by_camera.items() if rows >= self.settings.least_rows]
+        film, least = self.stream.marker.film_s, min(_FILM_PER_CAMERA_S * len(cameras), LONG_FILM_S)
+        if self.calibration is None and film < least:
+            return f"filmed for {film:.0f} s yet: {len(cameras)} cameras need {least:.0f} s"
         if len(ready) < 2 and self.stream.people.cameras:
             durations = {name: self.stream.people.seconds(name) for name in self.stream.people.cameras}
             if sum(seconds >= _MIN_PEOPLE_S for seconds in durations.values()) < 2:
@@ -450,7 +455,9 @@ class LiveHub:
         """Use an answer: the calibration that it gives, or why there is none."""
         job, boots = self._submitted, self._submitted_boots
         self._submitted = None
-        self._schedule.pause(self._submitted_at, answer.cpu_s, calibrated=self.calibration is not None)
+        tied = 0 if self.calibration is None else len(self.calibration.cameras)
+        mostly = job is not None and 2 * tied > len(job.rig.cameras)
+        self._schedule.pause(self._submitted_at, answer.cpu_s, calibrated=mostly)
         if job is None or answer.number <= self._superseded:
             return []
         self.solver_failure = answer.reason if answer.failed else ""

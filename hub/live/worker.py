@@ -13,7 +13,8 @@ from contextlib import suppress
 
 from hub.live.solver import SolverAnswer, SolverJob, run_job
 
-_BUDGET_S = 60.0  # s of CPU for one job
+_BUDGET_S, _BUDGET_PER_CAMERA_S = 60.0, 0.25
+"""CPU [s] for one job, or for each of its cameras where that is more: twice what those of a street take."""
 _IDLE_SHARE = 0.01  # of a core: one that computes had 0.13 beside twenty cameras on two cores, one that hangs has none
 _MEMORY_BYTES = 3 << 30  # of the solver's process
 _NICENESS = 5  # below the hub's own
@@ -32,6 +33,7 @@ class WorkerSolver:
         self._pool: ProcessPoolExecutor | None = None
         self._pid: Future[int] | None = None
         self._job: tuple[int, float, Future[SolverAnswer]] | None = None
+        self._least_budget_s = budget_s
         self._spent_s = self._spent_before_s = self._looked = 0.0  # CPU of the worker at the last look, before the job
         self.restarts = 0
 
@@ -43,6 +45,7 @@ class WorkerSolver:
     def submit(self, job: SolverJob, now: float) -> None:
         """Hand a job over; a worker is started where none runs."""
         self._job = job.number, now, self._started().submit(run_job, job)
+        self._budget_s = max(self._least_budget_s, _BUDGET_PER_CAMERA_S * len(job.rig.cameras))
         self._looked, self._spent_s = now, self._cpu_s()
         self._spent_before_s = self._spent_s
 

@@ -174,7 +174,7 @@ def frame_detections(
 def tracked_kind(detection: pb.Detection) -> str:
     """The kind under which a detection is tracked; "" for a labelled marker or corner: its label identifies it."""
     kind: str = detection.kind
-    if kind == "marker" or kind == "corner":  # noqa: PLR1714 - of each detection: a tuple takes longer
+    if kind == "marker" or kind == "corner":  # of each detection: a tuple takes longer
         return "" if detection.label else "marker"
     return kind
 

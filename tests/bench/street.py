@@ -1,7 +1,10 @@
-"""A street of cameras, each of which overlaps some ten others: ``python -m tests.bench.street [--cameras 60]``.
+"""A street of cameras, each overlapping some ten others: ``python -m tests.bench.street [--cameras 60] [--live]``.
 
 Prints the pairs that are chosen and solved, the cameras that are placed, and CPU seconds on one core: of the pairs, of
-all until the final adjustment is done, and of the whole calibration.
+all until the final adjustment is done, and of the whole calibration. With --live they
+are streamed to a hub in rounds of its loop, on a clock that advances by the film's time, so that other work on the
+machine changes nothing: an answer is used after the CPU that it took, and the hub keeps up where a second takes less
+than one of CPU. A transport's CPU is not in it.
 """
 
 from __future__ import annotations
@@ -9,9 +12,104 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
 
+from deploy.offline.exchange.session_log import _observation_messages, camera_info
 from hub.calibration.pipeline import calibrate
+from hub.clocks.external_prior import ExternalClockPrior
+from hub.live.agent import freeze_garbage_collector, status_message
+from hub.live.live_hub import LiveHub, LiveSettings
+from hub.live.solver import SolverAnswer, SolverJob
+from hub.live.worker import WorkerSolver
+from protocols.bus.transport.inbox import Inbox
+from protocols.core.clocks import NANOSECONDS
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.observations import Observations
+from protocols.session.rig import Rig
+from protocols.topics import OBSERVATION
+from protocols.validation.codec import encode
+from tests.bench.load import resident_mb
 from tests.support.long_street import street
+
+_ROUND_S = 0.05
+"""Film's time of a round of the hub's loop: as long as one takes while it is busy."""
+
+
+class _OwnCore(WorkerSolver):
+    """Answers at once, which are used after the CPU time that they took: as if the solver had a core to itself."""
+
+    def submit(self, job: SolverJob, now: float) -> None:
+        """Solve the job."""
+        super().submit(job, now)
+        while (answer := super().poll(now)) is None:
+            time.sleep(0.1)
+        print(f"{now:7.1f} s: {len(job.rig.cameras)} cameras, {len(job.observations)} rows: CPU {answer.cpu_s:.1f} s")
+        self._answer, self._due = answer, now + answer.cpu_s
+
+    @property
+    def busy(self) -> bool:
+        """Whether an answer was not used yet."""
+        return getattr(self, "_answer", None) is not None
+
+    def poll(self, now: float) -> SolverAnswer | None:
+        """The answer, when it is due."""
+        answer = None
+        if self.busy and now >= self._due:
+            answer, self._answer = self._answer, None
+        return answer
+
+
+def live(rig: Rig, observations: Observations, arrivals: Mapping[str, ExternalClockPrior], track: bool) -> None:
+    """Print what a hub makes of a session that is streamed to it, through its queue and gate."""
+    frames = []
+    for name, camera in rig.cameras.items():
+        offset = arrivals[name].unix_minus_camera
+        for message in _observation_messages(replace(rig, cameras={name: camera}), observations):
+            at = message.device_time_ns / NANOSECONDS + offset
+            frames.append((at, OBSERVATION.key_for("local", name), encode(message)))
+    frames.sort()
+    inbox, hub = Inbox(OBSERVATION), LiveHub(LiveSettings(track=track), solver=_OwnCore())
+    for name in rig.cameras:
+        hub.handle(camera_info(rig, name))
+    now = start = frames[0][0]
+    sent, spent, per_second, round_s, taken = 0, 0.0, list[float](), list[float](), 0
+    freeze_garbage_collector()
+    while sent < len(frames):
+        now += _ROUND_S
+        end = bisect_left(frames, (now, "", b""), sent)
+        inbox.push_all(
+            deque((key, payload, round(at * NANOSECONDS), "", True) for at, key, payload in frames[sent:end])
+        )
+        sent, began = end, time.process_time()
+        while received := inbox.drain():
+            taken += len(received)
+            for one in received:
+                hub.handle(one.message, one.arrival_ns / NANOSECONDS)
+        messages = hub.tick(now - start)
+        if (now - start) // 1.0 > len(per_second):
+            size = len(encode(status_message(hub, "hub", "boot", taken, [inbox.counters], now - start)))
+            spent += time.process_time() - began
+            per_second.append(spent)
+            if len(per_second) % 10 == 0:
+                print(
+                    f"{now - start:7.1f} s: {taken} frames, {inbox.counters['dropped']} dropped; {spent:.2f} s of CPU "
+                    f"in the last second, longest round {1e3 * max(round_s):.0f} ms; {resident_mb():.0f} MB with the "
+                    f"frames to send; status {size} bytes, {hub.state(now - start)[1][:60]}", flush=True,
+                )  # fmt: skip
+                round_s = []
+            spent, began = 0.0, time.process_time()
+        for message in messages:
+            encode(message)
+            if isinstance(message, pb.Calibration) and message.status == "solved":
+                print(f"{now - start:7.1f} s: {len(message.cameras)} cameras, {len(message.refused)} not", flush=True)
+        round_s.append(time.process_time() - began)
+        spent += round_s[-1]
+    solver_mb = resident_mb(hub.solver._pid.result())
+    print(f"CPU {1e6 * sum(per_second) / taken:.1f} µs a frame, solver {solver_mb:.0f} MB; {dict(hub.counters)}")
+    hub.solver.close()
 
 
 def main() -> int:
@@ -20,8 +118,14 @@ def main() -> int:
     parser.add_argument("--cameras", type=int, default=60)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=3)
+    parser.add_argument("--fps", type=float, default=30.0)
+    parser.add_argument("--live", action="store_true")
+    parser.add_argument("--no-tracks", action="store_true")
     options = parser.parse_args()
-    rig, observations, arrivals, _ = street(options.seed, cameras=options.cameras, seconds=options.seconds)
+    rig, observations, arrivals, _ = street(options.seed, options.cameras, options.seconds, options.fps)
+    if options.live:
+        live(rig, observations, arrivals, not options.no_tracks)
+        return 0
     began, marks = time.process_time(), {}
 
     def report(text: str, share: float) -> None:

@@ -162,14 +162,11 @@ class ZenohSubscription(InboxSubscription):
             )
         threading.Thread(target=self._collect, args=(self._subscriber.handler,), name=f"bus {key}").start()
         if self._reliable:
+            # A query waits for Zenoh's tables, which Zenoh holds while it waits for room in the channel.
             threading.Thread(target=self._recover, name=f"recovery {key}").start()
 
     def _recover(self) -> None:
-        """Send the queries, until the subscription is closed.
-
-        In a thread of its own: a query waits for Zenoh's tables, which Zenoh holds while it waits for the channel.
-        """
-        while (question := self._questions.get()) is not None:
+        for question in iter(self._questions.get, None):
             self._ask(question)
 
     def _collect(self, channel: zenoh.handlers.Handler[zenoh.Sample]) -> None:

@@ -80,6 +80,31 @@ def test_a_gap_that_zenoh_gave_up_is_asked_for_until_the_cache_has_answered(monk
         assert subscription.counters["lost"] == 0
 
 
+def test_messages_are_taken_while_a_query_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh held its tables while the channel was full, a query waited for them, and nobody emptied the channel."""
+    take, freed, lost = ZenohSubscription._take, threading.Event(), list[int]()
+
+    def with_a_gap(self: ZenohSubscription, sample: zenoh.Sample) -> object:
+        if sample.source_info is not None and sample.source_info.source_sn == 5 and not lost:
+            return lost.append(5)
+        return take(self, sample)
+
+    monkeypatch.setattr(ZenohSubscription, "_take", with_a_gap)
+    monkeypatch.setattr(ZenohSubscription, "_ask", lambda self, question: freed.wait(20.0))
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        subscription = receiving.subscribe(OBSERVATION)
+        first, second = (matched(sending.publisher(OBSERVATION, f"cam{number}")) for number in range(2))
+        for index in range(20):
+            first.put(observation("cam0", index))
+        assert eventually(lambda: lost == [5])
+        for index in range(20):
+            second.put(observation("cam1", index))
+        assert len(collect(subscription, 25)) == 25, "five before the gap, and all of the other camera"
+        freed.set()
+
+
 def test_one_message_that_cannot_be_taken_costs_no_other(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -111,7 +136,7 @@ def test_more_messages_than_the_channel_holds_arrive_while_nobody_drains() -> No
     config = BusConfig(mode="client", connect=(endpoint,))
     with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
         subscription = receiving.subscribe(OBSERVATION)
-        assert threading.active_count() == threads + 1
+        assert threading.active_count() == threads + 2, "one takes messages, one asks for lost ones"
         publisher = matched(sending.publisher(OBSERVATION, "cam0", rate_hz=1000.0, block=True))
         for index in range(5000):
             publisher.put(observation("cam0", index))

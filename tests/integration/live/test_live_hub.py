@@ -158,7 +158,7 @@ def test_of_a_long_recording_the_intervals_with_shared_motion_are_kept() -> None
     assert track.time[0] < 0.1
     assert (track.time < 10.0).sum() == 300
     assert track.time[-1] > 99.9
-    assert 10.0 <= builder.shared_motion_s("a") <= 12.0
+    assert 10.0 <= builder.shared_motions_s()["a"] <= 12.0
     runs = builder.ranges()
     assert [(camera, first) for camera, _, first, _, _ in runs if first == 0] == [("a", 0), ("b", 0)]
     assert sum(count for camera, *_, count in runs if camera == "a") == len(track)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from hub.live.agent import status_message
 from hub.live.budgets import MAX_CAMERAS, CameraBudgets
 from hub.live.fair_share import FairShare
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
+from hub.live.messages import refusal_message
 from hub.live.solver import InlineSolver, SolverAnswer, SolverJob
 from hub.view.state import ViewState
 from protocols.bus.base import Received
@@ -27,6 +29,7 @@ from protocols.session.builder import SessionBuilder
 from protocols.session.calibration import CameraCalibration
 from protocols.session.rig import Rig, RigCamera
 from protocols.topics import CALIBRATION, OBSERVATION, STATUS
+from protocols.validation.codec import decode, encode
 
 
 def frame(camera: str, number: int, points: int = 1, period_ns: int = 33_000_000, **fields: Any) -> pb.Observation:
@@ -85,6 +88,66 @@ def test_messages_of_many_senders_wait_within_one_bound() -> None:
     waiting = sum(len(one.message.detections) for queue in shares._waiting.values() for one in queue)  # type: ignore[attr-defined]
     assert 50_000 < waiting <= 100_000
     assert set(shares.dropped) == {f"cam{name}" for name in range(30)}
+
+
+def test_a_hub_that_is_far_behind_still_processes_messages() -> None:
+    """With a thousand senders each message that was too many took 60 µs to drop: the rounds had no time for others."""
+    now, done = [0.0], [0]
+
+    def handle(received: Received) -> None:
+        now[0] += 1e-4
+        done[0] += 1
+
+    def arriving(rounds: int) -> Iterator[Received]:
+        for number in range(rounds * 100):
+            now[0] += 1e-3  # each takes longer to put aside than to process
+            yield Received(OBSERVATION, f"cam{number % 100}", frame("cam0", number, 30), 0)
+
+    shares = FairShare(handle, lambda: now[0], 0.2)
+    for _ in range(5):
+        before = done[0]
+        shares.take(arriving(50))
+        now[0] += 1.0
+        assert done[0] - before >= 900
+    assert shares.dropped.total() > 10_000
+
+
+def test_reasons_of_a_thousand_cameras_fit_into_a_message() -> None:
+    """Five megabytes of pairs that failed: the message could not be sent, and the hub ended."""
+    reasons = {
+        f"cam{number}": "with another camera: the recordings overlap too little; " * 200 for number in range(1000)
+    }
+    message = refusal_message("; ".join(reasons.values()), reasons, 1, "refused")
+    assert decode(CALIBRATION, encode(message)) == message
+    assert [one.camera for one in message.refused] == list(reasons)
+
+
+def test_a_large_network_is_filmed_for_long_before_it_is_searched() -> None:
+    hub = LiveHub(LiveSettings(least_rows=10, interval_s=1e9))
+    for number in range(100):
+        hub.handle(info(f"cam{number}"))
+    for number in range(30 * 12):
+        hub.tick(number / 30.0)
+        for camera in range(100):
+            hub.handle(frame(f"cam{camera}", number))
+        if number % 30 == 0 and 30 < number < 30 * 8:
+            assert "100 cameras need 10 s" in hub.missing()
+    assert hub.missing() == ""
+
+
+def test_frames_are_left_out_where_all_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand cameras filled the memory in 15 s, and few pairs have enough motion in common in so short a film."""
+    monkeypatch.setattr("protocols.session.builder._MAX_ROWS", 3_000)
+    builder = SessionBuilder(180.0)
+    for camera in ("a", "b"):
+        builder.handle(info(camera))
+    for number in range(30 * 40):
+        for camera in ("a", "b"):
+            builder.handle(frame(camera, number, 4), number / 30.0)
+    held = builder.build()[1].tracks["a", "p0"].frame
+    assert set(np.diff(held).tolist()) == {3}, "ten of thirty a second"
+    assert len(held) * 8 <= 3_000 + 2 * 8 * 10 * 2, "and a chunk"
+    assert held[-1] - held[0] > 30 * 30
 
 
 @pytest.mark.parametrize(("offset", "bound"), [(1e308, 0.1), (0.0, -5.0), (0.0, 1e308)])
