@@ -58,7 +58,7 @@ class ScheduledHub(LiveHub):
         self.solver.poll(now)
         boots = {rows.camera: rows.boot_id for rows in event.rows}
         self._whole.select(
-            (rows.camera, _SEGMENT.sub("", rows.boot_id), rows.first_sequence, rows.last_sequence)
+            (rows.camera, _SEGMENT.sub("", rows.boot_id), rows.first_sequence, rows.last_sequence, rows.count)
             for rows in event.rows
         )
         rig, observations = self._whole.build()

@@ -134,7 +134,7 @@ class SessionBuilder:
         self._labels_of: dict[str, dict[str, int]] = {}
         self._since: dict[tuple[str, str], int] = {}
         self._is_thinned = False
-        self._selection: dict[str, list[tuple[str, int, int]]] | None = None
+        self._selection: dict[str, list[tuple[str, int, int, int]]] | None = None
         self.counters: Counter[str] = Counter()
 
     def handle(self, message: Message, moment: float = 0.0) -> None:
@@ -248,11 +248,11 @@ class SessionBuilder:
                 out.append((camera, self.boot(camera), int(inside.min()), int(inside.max()), len(inside)))
         return out
 
-    def select(self, ranges: Iterable[tuple[str, str, int, int]]) -> None:
-        """Let `build` use exactly these detections: camera, boot id, first and last sequence number of a run."""
+    def select(self, ranges: Iterable[tuple[str, str, int, int, int]]) -> None:
+        """Let `build` use exactly these detections, as `ranges` gave them."""
         self._selection = {}
-        for camera, boot, first, last in ranges:
-            self._selection.setdefault(camera, []).append((boot, first, last))
+        for camera, boot, first, last, count in ranges:
+            self._selection.setdefault(camera, []).append((boot, first, last, count))
 
     def _used(self, camera: str) -> tuple[Any, Ints]:
         """A camera's rows, and the indices of those that are used: one a time and label."""
@@ -265,10 +265,12 @@ class SessionBuilder:
             if not runs:
                 return nothing
             rows = boots[runs[0][0]].table()
-            sequence = rows["sequence"]
+            sequence, kept = rows["sequence"], rows["frame"] % self._every(camera) == 0
             inside = np.zeros(len(sequence), dtype=np.bool_)
-            for _, begin, end in runs:
-                inside |= (sequence >= begin) & (sequence <= end)
+            for _, begin, end, count in runs:
+                run = (sequence >= begin) & (sequence <= end)
+                thinned = run & kept
+                inside |= thinned if abs(thinned.sum() - count) < abs(run.sum() - count) else run
             return rows, self._one_a_time(rows, np.flatnonzero(inside))
         rows = boots[self.boot(camera)].table()
         used = np.flatnonzero(rows["time_ns"] >= self._since.get((camera, self.boot(camera)), -(2**63)))
@@ -297,6 +299,7 @@ class SessionBuilder:
             return
         chunk = self._advance(moment)
         if self._is_thinned and message.frame % self._every(camera):
+            self.counters["thinned"] += 1
             return
         detections = list(message.detections)
         if self._chunks is not None:

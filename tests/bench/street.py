@@ -41,24 +41,29 @@ _ROUND_S = 0.05
 class _OwnCore(WorkerSolver):
     """Answers at once, which are used after the CPU time that they took: as if the solver had a core to itself."""
 
+    _answer: SolverAnswer | None = None
+    _due = 0.0
+
     def submit(self, job: SolverJob, now: float) -> None:
         """Solve the job."""
         super().submit(job, now)
         while (answer := super().poll(now)) is None:
             time.sleep(0.1)
-        print(f"{now:7.1f} s: {len(job.rig.cameras)} cameras, {len(job.observations)} rows: CPU {answer.cpu_s:.1f} s")
+        placed = answer.reason[:100] if answer.calibration is None else f"{len(answer.calibration.cameras)} placed"
+        size = f"{len(job.rig.cameras)} cameras, {len(job.observations)} rows"
+        print(f"{now:7.1f} s: {size}: CPU {answer.cpu_s:.1f} s, {placed}", flush=True)
         self._answer, self._due = answer, now + answer.cpu_s
 
     @property
     def busy(self) -> bool:
         """Whether an answer was not used yet."""
-        return getattr(self, "_answer", None) is not None
+        return self._answer is not None
 
     def poll(self, now: float) -> SolverAnswer | None:
         """The answer, when it is due."""
-        answer = None
-        if self.busy and now >= self._due:
-            answer, self._answer = self._answer, None
+        if now < self._due:
+            return None
+        answer, self._answer = self._answer, None
         return answer
 
 
@@ -71,10 +76,12 @@ def live(rig: Rig, observations: Observations, arrivals: Mapping[str, ExternalCl
             at = message.device_time_ns / NANOSECONDS + offset
             frames.append((at, OBSERVATION.key_for("local", name), encode(message)))
     frames.sort()
-    inbox, hub = Inbox(OBSERVATION), LiveHub(LiveSettings(track=track), solver=_OwnCore())
+    inbox, solver = Inbox(OBSERVATION), _OwnCore()
+    hub = LiveHub(LiveSettings(track=track), solver=solver)
     for name in rig.cameras:
         hub.handle(camera_info(rig, name))
     now = start = frames[0][0]
+    begun_mb = resident_mb()
     sent, spent, per_second, round_s, taken = 0, 0.0, list[float](), list[float](), 0
     freeze_garbage_collector()
     while sent < len(frames):
@@ -86,8 +93,8 @@ def live(rig: Rig, observations: Observations, arrivals: Mapping[str, ExternalCl
         sent, began = end, time.process_time()
         while received := inbox.drain():
             taken += len(received)
-            for one in received:
-                hub.handle(one.message, one.arrival_ns / NANOSECONDS)
+            for frame in received:
+                hub.handle(frame.message, frame.arrival_ns / NANOSECONDS)
         messages = hub.tick(now - start)
         if (now - start) // 1.0 > len(per_second):
             size = len(encode(status_message(hub, "hub", "boot", taken, [inbox.counters], now - start)))
@@ -96,20 +103,20 @@ def live(rig: Rig, observations: Observations, arrivals: Mapping[str, ExternalCl
             if len(per_second) % 10 == 0:
                 print(
                     f"{now - start:7.1f} s: {taken} frames, {inbox.counters['dropped']} dropped; {spent:.2f} s of CPU "
-                    f"in the last second, longest round {1e3 * max(round_s):.0f} ms; {resident_mb():.0f} MB with the "
-                    f"frames to send; status {size} bytes, {hub.state(now - start)[1][:60]}", flush=True,
+                    f"in the last second, longest round {1e3 * max(round_s):.0f} ms; {resident_mb() - begun_mb:.0f} "
+                    f"MB more than at the beginning; status {size} bytes, {hub.state(now - start)[1][:60]}", flush=True,
                 )  # fmt: skip
                 round_s = []
             spent, began = 0.0, time.process_time()
-        for message in messages:
-            encode(message)
-            if isinstance(message, pb.Calibration) and message.status == "solved":
-                print(f"{now - start:7.1f} s: {len(message.cameras)} cameras, {len(message.refused)} not", flush=True)
+        for one in messages:
+            encode(one)
+            if isinstance(one, pb.Calibration) and one.status == "solved":
+                print(f"{now - start:7.1f} s: {len(one.cameras)} cameras, {len(one.refused)} not", flush=True)
         round_s.append(time.process_time() - began)
         spent += round_s[-1]
-    solver_mb = resident_mb(hub.solver._pid.result())
+    solver_mb = 0.0 if solver._pid is None else resident_mb(solver._pid.result())
     print(f"CPU {1e6 * sum(per_second) / taken:.1f} µs a frame, solver {solver_mb:.0f} MB; {dict(hub.counters)}")
-    hub.solver.close()
+    solver.close()
 
 
 def main() -> int:

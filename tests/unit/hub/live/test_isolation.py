@@ -138,16 +138,20 @@ def test_a_large_network_is_filmed_for_long_before_it_is_searched() -> None:
 def test_frames_are_left_out_where_all_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand cameras filled the memory in 15 s, and few pairs have enough motion in common in so short a film."""
     monkeypatch.setattr("protocols.session.builder._MAX_ROWS", 3_000)
-    builder = SessionBuilder(180.0)
-    for camera in ("a", "b"):
-        builder.handle(info(camera))
-    for number in range(30 * 40):
+    builder, whole = SessionBuilder(180.0), SessionBuilder()
+    for one in (builder, whole):
         for camera in ("a", "b"):
-            builder.handle(frame(camera, number, 4), number / 30.0)
+            one.handle(info(camera))
+        for number in range(30 * 40):
+            for camera in ("a", "b"):
+                one.handle(frame(camera, number, 4), number / 30.0)
     held = builder.build()[1].tracks["a", "p0"].frame
     assert set(np.diff(held).tolist()) == {3}, "ten of thirty a second"
     assert len(held) * 8 <= 3_000 + 2 * 8 * 10 * 2, "and a chunk"
     assert held[-1] - held[0] > 30 * 30
+    whole.select(builder.ranges())
+    replayed = whole.build()[1].tracks
+    assert all(np.array_equal(track.frame, replayed[key].frame) for key, track in builder.build()[1].tracks.items())
 
 
 @pytest.mark.parametrize(("offset", "bound"), [(1e308, 0.1), (0.0, -5.0), (0.0, 1e308)])
