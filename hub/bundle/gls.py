@@ -114,11 +114,6 @@ def solve_gls(
     return GlsSolution(state, cost, free)  # the covariance is of one step earlier, where it hardly differs
 
 
-def gls_cost(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, noise: CorrelatedNoise) -> float:
-    """The cost that `solve_gls` minimises, with the optimal correlated errors at a state; without control points."""
-    return _cost(problem, state, prior, _noise_blocks(problem, noise), None)
-
-
 def is_tractable(problem: Problem, noise: CorrelatedNoise) -> bool:
     """Whether the rows, and knots dense enough for piecewise linear correlated errors, stay within the size limits."""
     used = _used(problem)

@@ -212,6 +212,3 @@ def nominal_intrinsics(camera: RigCamera) -> Intrinsics:
 
 def _scaled(tracks: Mapping[str, ImageTrack], factor: float) -> dict[str, ImageTrack]:
     return {label: track.scaled(factor) if isinstance(track, SmoothTrack) else track for label, track in tracks.items()}
-
-
-__all__ = ["NO_INTRINSICS", "PreparedSession", "nominal_intrinsics", "prepare"]

@@ -500,10 +500,3 @@ def _disconnected_reason(name: str, groups: list[list[str]], pairs: list[PairSol
     if len(mine) > 1:
         return f"connected only to {listed(other for other in mine if other != name)}, not to the rest ({tried})"
     return f"could not be connected to any camera ({tried})"
-
-
-__all__ = [
-    "Progress",
-    "calibrate",
-    "solve_network",
-]

@@ -102,6 +102,3 @@ class RateChanges:
     def cameras(self) -> list[str]:
         """Cameras with a recent rate change."""
         return list(self._latest)
-
-
-__all__ = ["RateChange", "RateChanges"]

@@ -177,14 +177,11 @@ class _HubAgent:
                 self._node_publishers[state.camera].put(state)
         if hub.tracking is not None:
             hub.tracking.predicts = not self._shedding.sheds_predictions
+            hub.tracking.markers.smooths = not self._shedding.sheds_smoothed
         self._publish(hub.tick(now, final=final))
         if hub.tracking is not None:
-            smoothed = hub.tracking.smoothed()
-            if self._shedding.sheds_smoothed:
-                self._shedding.smoothed += len(smoothed)
-            else:
-                for track in smoothed:
-                    self._smoothed.put(track)
+            for track in hub.tracking.smoothed():
+                self._smoothed.put(track)
 
     def report(self, now: float, rig: Rig | None, *, last: bool) -> None:
         """Publish progress, the rig and the status, each when it is due."""
@@ -206,8 +203,8 @@ class _HubAgent:
         status = status_message(hub, self._agent, self._boot, self._sequence, counters, now)
         if shares.dropped:
             status.counters["dropped_behind"] = shares.dropped.total()
-        if self._shedding.smoothed:
-            status.counters["shed.smoothed"] = self._shedding.smoothed
+        if hub.tracking is not None and (left_out := hub.tracking.markers.counters["shed.smoothed"]):
+            status.counters["shed.smoothed"] = left_out
         shed = self._shedding.text(now)
         if shed and status.state == "running":
             status.state = "degraded"  # a page shows what such a status says

@@ -19,8 +19,6 @@ class Shedding:
 
     def __init__(self) -> None:
         self.behind_s = 0.0
-        self.smoothed = 0
-        """Smoothed tracks that were left out."""
         self._worst, self._last = 0.0, -float("inf")
 
     def see(self, behind_s: float, now: float) -> None:

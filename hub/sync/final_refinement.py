@@ -216,6 +216,3 @@ def _test_sensitivity(
         ),
     )
     return with_tests(solution, tests, fit)
-
-
-__all__ = ["LIKELIHOOD_MARGIN", "LTS_INLIER_PX", "refine_and_test", "rotation_bound"]

@@ -42,6 +42,8 @@ class MarkerTracks:
     def __init__(self, lag_s: float, coast_s: float, interval_s: float) -> None:
         self.cameras: dict[str, TrackingCamera] = {}
         self.counters: Counter[str] = Counter()
+        self.smooths = True
+        """Whether tracks are smoothed; messages left out are counted as ``shed.smoothed``."""
         self._times_ns = tuple(round(seconds * NANOSECONDS) for seconds in (lag_s, coast_s, interval_s))
         self._coast_s = coast_s
         self._early: dict[str, deque[pb.Observation]] = {}
@@ -51,8 +53,7 @@ class MarkerTracks:
         self._smoothed: deque[pb.Track] = deque(maxlen=_MAX_SMOOTHED)
         self._heard: dict[str, float] = {}
         self._fresh: set[str] = set()
-        self._last = ""
-        """The camera of the last frame."""
+        self._last = ""  # the camera of the last frame
 
     def calibrate(self, cameras: Mapping[str, TrackingCamera], change: Similarity | None) -> None:
         """Use a new calibration; the kept rows are processed again with it.
@@ -109,7 +110,10 @@ class MarkerTracks:
         out = []
         for label, track in list(self._labels.items()):
             self.counters["marker.steps"] += track.advance(newest)
-            self._smoothed.extend(track.smoothed(newest))
+            if self.smooths:
+                self._smoothed.extend(track.smoothed(newest))
+            else:
+                self.counters["shed.smoothed"] += track.skip_smoothed(newest)
             out += track.messages(newest, not alive)
             if track.is_over(newest):
                 del self._labels[label]
@@ -243,6 +247,13 @@ class _LabelTrack:
                         out.append(marker_message(self._label, state, state.time_ns, (mean, covariance)))
         self._rows.forget()
         return out
+
+    def skip_smoothed(self, newest_ns: int) -> int:
+        """Leave the smoothed messages out that are due, and forget the rows behind them; their number."""
+        due = self._accepted(self._smoothed_ns, max(newest_ns, self._rows.newest_ns or newest_ns) - self._lag_ns)
+        self._smoothed_ns = due[-1].time_ns if due else self._smoothed_ns
+        self._rows.forget()
+        return len(due)
 
     def is_over(self, newest_ns: int) -> bool:
         """Whether nothing is left to publish or to track."""

@@ -67,7 +67,7 @@ class _OwnCore(WorkerSolver):
         return answer
 
 
-def live(rig: Rig, observations: Observations, arrivals: Mapping[str, ExternalClockPrior], track: bool) -> None:
+def live(rig: Rig, observations: Observations, arrivals: Mapping[str, ExternalClockPrior], without: str) -> None:
     """Print what a hub makes of a session that is streamed to it, through its queue and gate."""
     frames = []
     for name, camera in rig.cameras.items():
@@ -77,7 +77,9 @@ def live(rig: Rig, observations: Observations, arrivals: Mapping[str, ExternalCl
             frames.append((at, OBSERVATION.key_for("local", name), encode(message)))
     frames.sort()
     inbox, solver = Inbox(OBSERVATION), _OwnCore()
-    hub = LiveHub(LiveSettings(track=track), solver=solver)
+    hub = LiveHub(LiveSettings(track=without != "tracks"), solver=solver)
+    if hub.tracking is not None:
+        hub.tracking.markers.smooths = without != "smoothing"
     for name in rig.cameras:
         hub.handle(camera_info(rig, name))
     now = start = frames[0][0]
@@ -127,11 +129,11 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--fps", type=float, default=30.0)
     parser.add_argument("--live", action="store_true")
-    parser.add_argument("--no-tracks", action="store_true")
+    parser.add_argument("--without", choices=("tracks", "smoothing"), help="of what a hub makes live")
     options = parser.parse_args()
     rig, observations, arrivals, _ = street(options.seed, options.cameras, options.seconds, options.fps)
     if options.live:
-        live(rig, observations, arrivals, not options.no_tracks)
+        live(rig, observations, arrivals, options.without)
         return 0
     began, marks = time.process_time(), {}
 

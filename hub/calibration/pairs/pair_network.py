@@ -494,6 +494,3 @@ def pair_lag(prepared: PreparedSession, pair: PairSolution, fit: PairFit) -> flo
 def _time_span(prepared: PreparedSession, name: str) -> tuple[float, float]:
     tracks = prepared.camera(name).tracks.values()
     return min(float(track.time[0]) for track in tracks), max(float(track.time[-1]) for track in tracks)
-
-
-__all__ = ["Progress", "describe_timing", "frame_rate_warnings", "pair_lag", "solve_one_pair", "solve_pairs"]

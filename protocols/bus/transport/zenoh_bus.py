@@ -163,11 +163,8 @@ class ZenohSubscription(InboxSubscription):
         threading.Thread(target=self._collect, args=(self._subscriber.handler,), name=f"bus {key}").start()
         if self._reliable:
             # A query waits for Zenoh's tables, which Zenoh holds while it waits for room in the channel.
-            threading.Thread(target=self._recover, name=f"recovery {key}").start()
-
-    def _recover(self) -> None:
-        for question in iter(self._questions.get, None):
-            self._ask(question)
+            asking = map(self._ask, iter(self._questions.get, None))
+            threading.Thread(target=deque, args=(asking, 0), name=f"recovery {key}").start()
 
     def _collect(self, channel: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """Queue what arrives, until the subscription is closed.

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 from hub.bundle.adjustment import adjust, apply_step
 from hub.bundle.block_matrix import DenseCovariance
 from hub.bundle.covariance import CameraCovariance, covariance
-from hub.bundle.gls import GlsSolution, SparseEntries, gls_cost, is_tractable, solve_gls
+from hub.bundle.gls import GlsSolution, SparseEntries, _cost, _noise_blocks, is_tractable, solve_gls
 from hub.bundle.noise import correlated_noise
 from hub.bundle.noise.correlated_noise import lens_tolerance, prefers_nominal_lenses, refit_with_correlated_noise
 from hub.bundle.noise.gauss_markov import GaussMarkov, estimate_correlated_noise, fit_maximum_likelihood
@@ -35,6 +35,11 @@ from tests.support.rigs import random_lens, random_path, random_poses
 SECONDS, RATE = 60.0, 15.0
 WHITE, CORRELATED, TIME_CONSTANT = 0.4, 1.5, 2.0
 CAMERAS = 4
+
+
+def gls_cost(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior, noise: CorrelatedNoise) -> float:
+    """The cost that `solve_gls` minimises, with the optimal correlated errors at a state."""
+    return _cost(problem, state, prior, _noise_blocks(problem, noise), None)
 
 
 def gauss_markov_errors(rng: np.random.Generator, time: Floats, std: float, seconds: float) -> Floats:

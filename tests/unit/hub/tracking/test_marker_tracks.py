@@ -182,6 +182,19 @@ def test_a_delayed_hub_publishes_the_missed_times_in_order() -> None:
         assert [track.sequence for track in tracks] == list(range(len(tracks)))
 
 
+def test_smoothed_tracks_that_are_left_out_are_counted_and_change_nothing_else() -> None:
+    filtered, smoothed = follow(calibrated(plain().calibration), plain().messages)
+    live, half = calibrated(plain().calibration), len(plain().messages) // 2
+    live.markers.smooths = False
+    first = follow(live, plain().messages[:half])
+    live.markers.smooths = True
+    rest = follow(live, plain().messages[half:])
+    assert len(first[0]) + len(rest[0]) == len(filtered)
+    assert not first[1]
+    assert [track.sequence for track in rest[1]] == list(range(len(rest[1])))
+    assert live.counters["shed.smoothed"] + len(rest[1]) == pytest.approx(len(smoothed), abs=5)
+
+
 def test_smoothed_tracks_lag_by_the_lag() -> None:
     live = calibrated(plain().calibration)
     for arrival, message in plain().messages:
