@@ -15,6 +15,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
+from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
 from hub.calibration.unconnected import listed
 from hub.clocks.observation_stream import LEAST_ROWS, ObservationStream
 from hub.distributed.network.host import NodeHost
@@ -449,7 +450,9 @@ class LiveHub:
             return None
         present, now_boots = self._in_present_segments(self.calibration)
         kept = {name: camera for name, camera in present.cameras.items() if now_boots[name] == boots.get(name)}
-        return replace(present, cameras=kept) if len(kept) > 1 else None
+        # Most of a large network in one search cost less than a search for each of them.
+        begins_anew = len(boots) > LARGE_NETWORK and 2 * len(kept) < len(boots)
+        return replace(present, cameras=kept) if len(kept) > 1 and not begins_anew else None
 
     def _take(self, answer: SolverAnswer, now: float) -> list[Message]:
         """Use an answer: the calibration that it gives, or why there is none."""
@@ -492,6 +495,8 @@ class LiveHub:
         self._reloaded = None
         self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
         self.session = job.rig, job.observations
+        if job.last is None and self.calibration is not None and self.tracking is not None:
+            self.tracking = LiveTracking()  # in another world frame
         self._report_steps(found)
         self.calibration, self.calibrated_at = found, now
         self._solved_boot_ids = {name: boots[name] for name in found.cameras if name in boots}
