@@ -13,8 +13,8 @@ from contextlib import suppress
 
 from hub.live.solver import SolverAnswer, SolverJob, run_job
 
-_BUDGET_S, _BUDGET_PER_CAMERA_S = 60.0, 0.25
-"""CPU [s] for one job, or for each of its cameras where that is more: twice what those of a street take."""
+_BUDGET_S, _CAMERAS = 60.0, 240
+"""CPU [s] for one job of so many cameras, and of more for each as much: twice what those of a street take."""
 _IDLE_SHARE = 0.01  # of a core: one that computes had 0.13 beside twenty cameras on two cores, one that hangs has none
 _MEMORY_BYTES = 3 << 30  # of the solver's process
 _NICENESS = 5  # below the hub's own
@@ -33,7 +33,7 @@ class WorkerSolver:
         self._pool: ProcessPoolExecutor | None = None
         self._pid: Future[int] | None = None
         self._job: tuple[int, float, Future[SolverAnswer]] | None = None
-        self._least_budget_s = budget_s
+        self._share = 1.0  # of the budget that the job has
         self._spent_s = self._spent_before_s = self._looked = 0.0  # CPU of the worker at the last look, before the job
         self.restarts = 0
 
@@ -45,7 +45,7 @@ class WorkerSolver:
     def submit(self, job: SolverJob, now: float) -> None:
         """Hand a job over; a worker is started where none runs."""
         self._job = job.number, now, self._started().submit(run_job, job)
-        self._budget_s = max(self._least_budget_s, _BUDGET_PER_CAMERA_S * len(job.rig.cameras))
+        self._share = max(1.0, len(job.rig.cameras) / _CAMERAS)
         self._looked, self._spent_s = now, self._cpu_s()
         self._spent_before_s = self._spent_s
 
@@ -63,16 +63,18 @@ class WorkerSolver:
                 return SolverAnswer(number, reason="the solver's process ended", failed=True)
             except Exception as error:  # noqa: BLE001 - whatever a job raised there is a failed job here
                 return SolverAnswer(number, reason=f"the solver failed: {type(error).__name__}: {error}", failed=True)
-        if now - since <= self._budget_s or self._works(now):
+        if now - since <= self._share * self._budget_s or self._works(now):
             return None
         self._job = None
         self._end()
-        return SolverAnswer(number, reason=f"no answer within {self._budget_s:g} s", failed=True, cpu_s=now - since)
+        return SolverAnswer(
+            number, reason=f"no answer within {self._share * self._budget_s:g} s", failed=True, cpu_s=now - since
+        )
 
     def _works(self, now: float) -> bool:
         """Whether a job that takes long is within its CPU and gets some: a busy machine is no reason to end it."""
         spent = self._cpu_s()
-        within = spent - self._spent_before_s <= self._budget_s
+        within = spent - self._spent_before_s <= self._share * self._budget_s
         if not within or now - self._looked <= self._budget_s:
             return within
         idle = spent - self._spent_s < _IDLE_SHARE * (now - self._looked)
