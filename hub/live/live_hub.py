@@ -458,9 +458,8 @@ class LiveHub:
         """Use an answer: the calibration that it gives, or why there is none."""
         job, boots = self._submitted, self._submitted_boots
         self._submitted = None
-        tied = 0 if self.calibration is None else len(self.calibration.cameras)
-        mostly = job is not None and 2 * tied > len(job.rig.cameras)
-        self._schedule.pause(self._submitted_at, answer.cpu_s, calibrated=mostly)
+        tied, cameras = (len(one.cameras) if one else 0 for one in (self.calibration, job and job.rig))
+        self._schedule.pause(self._submitted_at, answer.cpu_s, calibrated=2 * tied > cameras)
         if job is None or answer.number <= self._superseded:
             return []
         self.solver_failure = answer.reason if answer.failed else ""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.unit.test_structure import PACKAGES, ROOT, _tracked
 
-MOST_SOURCE_LINES = 91_520  # 655 more: large networks, steps told from rates, noise over redundancy, lens stds, colour
+MOST_SOURCE_LINES = 91_564  # 44 more: large networks live, hubs that are behind, queries in a thread of their own
 MOST_UNEXPLAINED_CONSTANTS = 134
 MOST_COMPLEXITY = 15
 
