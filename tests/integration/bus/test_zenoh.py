@@ -103,6 +103,7 @@ def test_messages_are_taken_while_a_query_waits(monkeypatch: pytest.MonkeyPatch)
             second.put(observation("cam1", index))
         assert len(collect(subscription, 25)) == 25, "five before the gap, and all of the other camera"
         freed.set()
+    assert eventually(lambda: not [one for one in threading.enumerate() if one.name.startswith(("bus ", "recovery "))])
 
 
 def test_one_message_that_cannot_be_taken_costs_no_other(
@@ -132,6 +133,7 @@ def test_one_message_that_cannot_be_taken_costs_no_other(
 
 def test_more_messages_than_the_channel_holds_arrive_while_nobody_drains() -> None:
     """And in order; a closed subscription leaves no thread behind, and what is queued can still be drained."""
+    assert eventually(lambda: not [one for one in threading.enumerate() if one.name.startswith(("bus ", "recovery "))])
     endpoint, threads = free_endpoint(), threading.active_count()
     config = BusConfig(mode="client", connect=(endpoint,))
     with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
