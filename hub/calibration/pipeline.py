@@ -40,7 +40,7 @@ from hub.calibration.pairs.pair_network import (
     solve_pairs,
 )
 from hub.calibration.result import assemble_calibration, isolated_pair_report
-from hub.calibration.self_calibration import initial_self_calibration, with_updated_lenses
+from hub.calibration.self_calibration import LEAST_CAMERAS, initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
 from hub.calibration.unconnected import connect_by_resection, listed
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
@@ -437,7 +437,9 @@ def _largest_component(
     if not solved:
         reasons = refused | {name: _unplaced_reason(name, prepared, pairs) for name in names}
         refusal = Refused(_no_pair_reason(prepared, placeable, refused), in_rig_order(reasons, prepared))
-        refusal.permanent = len(prepared.cameras) < 2 and len(prepared.uncalibrated) > 0
+        refusal.permanent = (
+            len(prepared.uncalibrated) > 0 and len(prepared.cameras) < 2 and len(prepared.names) < LEAST_CAMERAS
+        )
         raise refusal
     groups = connected_components(names, solved)
     for name in [name for name in names if name not in groups[0]]:
