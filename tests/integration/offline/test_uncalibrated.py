@@ -147,7 +147,7 @@ def test_two_cameras_that_cannot_be_placed_are_refused_with_their_timing(
 
 
 @pytest.mark.parametrize(("cameras", "permanent"), [(2, True), (3, False)])
-def test_a_refusal_lasts_only_where_more_observations_cannot_determine_the_lenses(cameras: int, permanent: bool) -> None:
+def test_a_refusal_lasts_only_where_more_rows_cannot_determine_the_lenses(cameras: int, permanent: bool) -> None:
     session = without_lenses(simulate(2, cameras, 4), *(f"cam{n}" for n in range(cameras)))
     with pytest.raises(Refused) as caught:
         calibrate(session.rig, session.observations())
