@@ -31,6 +31,7 @@ from hub.calibration.acceptance import (
     network_failure,
 )
 from hub.calibration.final_adjustment import final_adjustment
+from hub.calibration.moved_cameras import moved_cameras, without_moved
 from hub.calibration.pairs.pair_network import (
     Progress,
     coincide,
@@ -138,6 +139,15 @@ def calibrate(
             solution = solve_with_unknown_lenses(
                 rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
             )
+        if thorough and solver == "joint" and known is None and not prepared.shared_clock:
+            moves = moved_cameras(solution, observations)
+            if moves:
+                found = calibrate(
+                    rig, without_moved(observations, moves), progress,
+                    thorough=True, clock_priors=clock_priors, refine_lenses=refine_lenses,
+                )  # fmt: skip
+                told = tuple(move.told(name) for name, move in moves.items())
+                return replace(found, warnings=(*found.warnings, *told))
         report("covariances", 0.95)
         return assemble_calibration(rig, solution, refine_lenses=refine_lenses)
     except Refused as refusal:
