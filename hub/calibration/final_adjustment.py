@@ -114,7 +114,8 @@ def final_adjustment(
         if refitted[1] is not state:
             return replace(reconstruction, problem=refitted[0], state=refitted[1])
     if not online and any(one > sigma_limit(state, camera) for camera, one in enumerate(state.sigma)):
-        lens, step = wrong_lens(problem, state), model_comparison.find_clock_step(problem, state)
+        lens = wrong_lens(problem, state)
+        step = None if lens is None else model_comparison.find_clock_step(problem, state)
         if lens is not None and (step is None or step.statistic < lens.statistic):
             return reconstruction  # the camera will be left out
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
