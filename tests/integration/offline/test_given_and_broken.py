@@ -30,7 +30,7 @@ from protocols.session.folder import read_folder
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.result import result_document
 from protocols.session.rig import Rig, RigCamera
-from tests.bench import broken_cameras, lasting_errors
+from tests.bench import broken_cameras, clock_models, lasting_errors
 from tests.bench.clock_steps import Put, stepped
 from tests.bench.pose_worlds import FOCAL, cube, errors, joint_optimum, observe, section_4
 from tests.bench.simulated_rigs import make_rallies
@@ -152,6 +152,15 @@ def test_the_pairs_of_a_camera_with_a_wrong_lens_are_searched_once(monkeypatch: 
     solve_pairs(prepare(half.rig, half.observations()), lambda text, share: None, thorough="first pair")
     assert len(searched) == len(set(searched))
     assert len(starts) < 220
+
+
+def test_the_step_of_one_of_three_clocks_is_not_blamed_on_the_two_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clock_models, "CAMERAS", 3)
+    world = clock_models.World(12.0, 0.5, (10.0, 30.0, 15.0), 0.7, 0.0, 1)
+    rig, observations, clocks = clock_models.session(7102, "step60", world)
+    found = calibrate(rig, observations)
+    assert [name for name, one in found.cameras.items() if one.clock_steps] == ["cam1"]
+    assert found.cameras["cam1"].clock_steps[0][1] == pytest.approx(clocks["cam1"].steps[0][1], rel=0.1)
 
 
 @pytest.mark.parametrize(("seed", "seconds", "noise"), [(2003, 12.0, 0.3), (2061, 20.0, 0.7)])
