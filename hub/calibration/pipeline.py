@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -23,13 +24,7 @@ from hub.bundle.noise.noise_scale import residual_std
 from hub.bundle.noise.timestamp_jitter import estimate_frame_times
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
-from hub.calibration.acceptance import (
-    LAG_CONFLICT,
-    CameraTests,
-    least_certain_camera,
-    misfits,
-    network_failure,
-)
+from hub.calibration.acceptance import LAG_CONFLICT, CameraTests, misfits, network_failure
 from hub.calibration.final_adjustment import final_adjustment
 from hub.calibration.moved_cameras import moved_cameras, without_moved
 from hub.calibration.pairs.pair_network import (
@@ -287,6 +282,7 @@ def solve_network(
     distributed_solver: places the cameras with pose nodes; None = incremental reconstruction and bundle adjustment.
     """
     refused = dict(prepared.refused)
+    final = partial(final_adjustment, report=report, online=online, refine_lenses=refine_lenses)
     free_parameters = FreeParameters(clock=not prepared.shared_clock)
     graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
     unfit, failures = set[str](), CameraTests()
@@ -302,7 +298,7 @@ def solve_network(
                 if placed.keys() == graph.clocks.keys()
                 else reconstruct_incrementally(*session, lambda text: report(text, 0.6), with_rate_prior)
             )
-            reconstruction = final_adjustment(reconstruction, report, online=online, refine_lenses=refine_lenses)
+            reconstruction = final(reconstruction, warm=bool(placed) and not (online or refine_lenses))
             # The narrow rate prior only stabilises the estimate; stds are computed with the usual one.
             usual = replace(reconstruction.problem.free_parameters, rate_std=free_parameters.rate_std)
             reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
@@ -333,7 +329,7 @@ def solve_network(
             reconstruction,
             unconnected,
             free_parameters,
-            lambda trial: final_adjustment(trial, report, online=online, refine_lenses=refine_lenses),
+            lambda trial: final(trial, warm=not (online or refine_lenses)),
             _misfit,
         )
         if more:
@@ -354,11 +350,12 @@ def solve_network(
 
 
 def _misfit(reconstruction: Reconstruction, name: str) -> str:
-    """Why a camera does not fit the others; "" if it does."""
-    failures = [failure for failure in misfits(reconstruction) if failure[0] == name]
-    certain = least_certain_camera(reconstruction) if not failures else None
-    failures += [certain] if certain is not None and certain[0] == name else []
-    return failures[0][1].reason if failures else ""
+    """Why a camera does not fit the others, or makes one of these fail, which passed without it; "" if it fits."""
+    own = [failure for failure in misfits(reconstruction) if failure[0] == name]
+    failure = own[0] if own else network_failure(reconstruction, (), {})
+    if failure is None or failure[0] == name:
+        return "" if failure is None else failure[1].reason
+    return f"with it {failure[0]} fails: {failure[1].reason}"
 
 
 def _rate_prior_std(graph: ClockGraph, usual: float) -> float:
