@@ -3,8 +3,8 @@
     python -m tests.bench.broken_cameras [--cameras N] [--seconds S] [--seeds N] [--first SEED] [--session FOLDER]
 
 Each rig is calibrated without its last camera, with it as it is, and with it broken in one way after the other: rows
-labelled by another frame numbering, rows shuffled, another recording, a mirrored picture, a wrong lens (focal length
-1.3 times too long). CPU seconds are those of `calibrate`; change: the largest change of another camera's position or
+labelled by another frame numbering, rows shuffled, another recording, a mirrored or turned picture, wrong lenses, a
+camera that is moved. CPU seconds are those of `calibrate`; change: the largest change of another camera's position or
 lag, in its stated stds. Requirement: at most twice the CPU without it, named, changes below one std.
 --session: a recorded session instead of simulated ones, each of its cameras broken in turn.
 """
@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from hub.calibration.pipeline import calibrate
+from protocols.geometry import so3
 from protocols.geometry.types import Bools
 from protocols.session.calibration import Calibration
 from protocols.session.folder import read_folder
@@ -94,6 +95,17 @@ def fisheye(session: rigs.Session, name: str, mine: Bools, random: np.random.Gen
     return replace(session, pixels=pixels)
 
 
+def moved(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
+    """The camera is turned by 1° to 10° at a quarter to three quarters of the recording."""
+    lens, pixels = session.rig.cameras[name].intrinsics, session.pixels.copy()
+    assert lens is not None
+    after = mine & (session.time > np.quantile(session.time[mine], random.uniform(0.25, 0.75)))
+    axis = random.normal(size=3)
+    turn = so3.exp(np.deg2rad(10.0 ** random.uniform(0.0, 1.0)) * axis / np.linalg.norm(axis))
+    pixels[after] = lens.project(np.column_stack([lens.unproject(pixels[after]), np.ones(after.sum())]) @ turn.T)
+    return replace(session, pixels=pixels)
+
+
 BREAKAGES: dict[str, Breakage] = {
     "other numbering": other_numbering,
     "shuffled": shuffled,
@@ -106,6 +118,7 @@ BREAKAGES: dict[str, Breakage] = {
     "crop": lambda session, name, mine, _: wrong_lens(session, name, mine, 1.0, moved=0.2),
     "turned": turned,
     "fisheye": fisheye,
+    "moved": moved,
 }
 
 

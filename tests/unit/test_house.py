@@ -11,7 +11,9 @@ from pathlib import Path
 
 from tests.unit.test_structure import PACKAGES, ROOT, _tracked
 
-MOST_SOURCE_LINES = 91_621  # 101 more: what a linear test of a lens predicts is confirmed; one step instead of opposite ones
+MOST_SOURCE_LINES = (
+    91_621  # 101 more: what a linear test of a lens predicts is confirmed; one step instead of opposite ones
+)
 MOST_UNEXPLAINED_CONSTANTS = 134
 MOST_COMPLEXITY = 15
 
