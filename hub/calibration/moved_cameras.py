@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.bundle.initialisation import CameraInput
+from hub.bundle.initialisation import CameraInput, Reconstruction
+from hub.bundle.preprocessing import PreparedSession
 from hub.calibration.resection_scan import (
     LIKELY_CANDIDATES,
     MIN_INLIERS,
@@ -36,8 +37,8 @@ _STARTS, _ITERATIONS = (0.25, 0.5, 0.75), 5
 _LEAST_GAIN = 2.0
 """Cost of one pose over that of two: 1.01 to 1.05 of cameras that stand still (simulated, also with lenses 20 % off,
 clocks that step, wander or drift), 1.05 to 1.33 of two recorded rigs; 2.4 of one turned by half a degree, 20 by one."""
-_LEAST_OTHERS = 2  # with one, either may have moved
-_MOST_ROWS = 400  # of a camera: its poses need no more
+_LEAST_ROWS, _MOST_ROWS = 30, 400
+"""Rows of a camera on each side of a move, as many as a camera of a network needs; of all, no more are used."""
 _MARGIN_S = 0.3
 """Around a move, left out too: nobody moves a camera in an instant, and the rows were smoothed across it."""
 
@@ -61,29 +62,38 @@ class Move:
 
 
 def moved_cameras(solution: Solution, observations: Observations) -> dict[str, Move]:
-    """The refused cameras that were moved, and of the others the one that most probably was: it distorts the path."""
+    """The refused cameras that were moved, and of the others the one that most probably was."""
     reconstruction, prepared = solution.reconstruction, solution.prepared
-    clocks = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
     divisions: dict[str, tuple[float, float, float]] = {}
-    for name, camera in prepared.cameras.items():
-        labels, clock = seen_labels(camera, reconstruction), clocks.get(name)
-        if not labels or len(clocks) - (name in clocks) < _LEAST_OTHERS:
-            continue
-        if clock is None:
-            maps = _likely_maps(labels, camera)
-        else:
-            maps = [(clock.rate, clock.offset - clock.rate * clock.centre)]
-        best = max((one for at in maps if (one := _divide(labels, camera, *at)) is not None), default=None)
-        divisions |= {} if best is None else {name: best}
-    worst = max(clocks.keys() & divisions.keys(), key=lambda name: divisions[name], default="")
+    for name in [name for name in prepared.cameras if name not in reconstruction.names]:
+        labels = seen_labels(prepared.cameras[name], reconstruction)
+        maps = _likely_maps(labels, prepared.cameras[name]) if labels and len(reconstruction.names) > 1 else []
+        found = max((one for at in maps if (one := _divide(labels, prepared.cameras[name], *at))), default=None)
+        divisions |= {} if found is None else {name: found}
+    placed = moved_camera(prepared, reconstruction)
+    divisions |= {} if placed is None else {placed[0]: placed[1]}
     out = {}
     for name, (_, at, turned) in divisions.items():
-        if name not in clocks or name == worst:
-            time = at / prepared.time_scale(name) + prepared.time_origins[name]
-            rows = np.concatenate([track.time for track in observations.of_camera(name)])
-            before, after = int((rows < time).sum()), int((rows > time).sum())
-            out[name] = Move(time, turned, after > before, min(before, after))
+        time = at / prepared.time_scale(name) + prepared.time_origins[name]
+        rows = np.concatenate([track.time for track in observations.of_camera(name)])
+        before, after = int((rows < time).sum()), int((rows > time).sum())
+        out[name] = Move(time, turned, after > before, min(before, after))
     return out
+
+
+def moved_camera(
+    prepared: PreparedSession, reconstruction: Reconstruction
+) -> tuple[str, tuple[float, float, float]] | None:
+    """Of the placed cameras the one that most probably was moved, which distorts the path for all: its name, gain, time
+    [s] since its origin and angle [rad]. None where none was, or where fewer than two others are placed."""
+    found: dict[str, tuple[float, float, float]] = {}
+    for name, clock in zip(reconstruction.names, reconstruction.state.cameras, strict=True):
+        labels = seen_labels(prepared.cameras[name], reconstruction)
+        if labels and len(reconstruction.names) > 2:
+            offset = clock.offset - clock.rate * clock.centre
+            divided = _divide(labels, prepared.cameras[name], clock.rate, offset)
+            found |= {} if divided is None else {name: divided}
+    return max(found.items(), key=lambda one: one[1], default=None)
 
 
 def without_moved(observations: Observations, moves: Mapping[str, Move]) -> Observations:
@@ -124,20 +134,21 @@ def _divide(
     order = np.argsort(internal, kind="stable")[:: max(1, len(internal) // _MOST_ROWS)]
     world, image, times = world[order], image[order], (internal[order] - offset) / rate
     count, focal = len(times), camera.intrinsics.focal
-    if count < 2 * MIN_POINTS:
+    least = max(MIN_POINTS, _LEAST_ROWS * count // len(internal))
+    if count < 2 * least:
         return None
 
     def costs(part: slice) -> Floats:
         residual = resected_residuals(world[part], image[part], world, image, focal)
         return np.asarray(np.minimum(residual, TRUNCATION_PX) ** 2)
 
-    best = float("inf"), 0
+    best = float("inf"), least
     for start in _STARTS:
         at = int(start * count)
         for _ in range(_ITERATIONS):
             first, second = costs(slice(at)), costs(slice(at, None))
             total = np.cumsum(first - second) + second.sum()  # where the first ends behind each row
-            new = MIN_POINTS + int(np.argmin(total[MIN_POINTS - 1 : count - MIN_POINTS]))
+            new = least + int(np.argmin(total[least - 1 : count - least]))
             best = min(best, (float(total[new - 1]) / count, new))
             if new == at:
                 break
