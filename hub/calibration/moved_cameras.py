@@ -37,6 +37,7 @@ _STARTS, _ITERATIONS = (0.25, 0.5, 0.75), 5
 _LEAST_GAIN = 2.0
 """Cost of one pose over that of two: 1.01 to 1.05 of cameras that stand still (simulated, also with lenses 20 % off,
 clocks that step, wander or drift), 1.05 to 1.33 of two recorded rigs; 2.4 of one turned by half a degree, 20 by one."""
+_LEAST_S = 1.0  # on each side of a move: half a second of a path gave a pose that was 22° off
 _LEAST_ROWS, _MOST_ROWS = 30, 400
 """Rows of a camera on each side of a move, as many as a camera of a network needs; of all, no more are used."""
 _MARGIN_S = 0.3
@@ -154,6 +155,8 @@ def _divide(
                 break
             at = new
     cost, at = best
+    if min(times[at - 1] - times[0], times[-1] - times[at]) < _LEAST_S:
+        return None
     poses = resect(world[:at], image[:at]), resect(world[at:], image[at:])
     explained = [float((costs(part)[part] < TRUNCATION_PX**2).mean()) for part in (slice(at), slice(at, None))]
     gain = float(costs(slice(None)).mean()) / max(cost, 1e-9)
