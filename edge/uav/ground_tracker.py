@@ -416,13 +416,8 @@ class GroundTracker:
             rate = 1.0 if self._relearn_road else _ROAD_LEARNING_RATE
             self._road.learn_colours(corrected[at[:, 1], at[:, 0]], corrected[::4, ::4].reshape(-1, 3), rate)
             self._relearn_road = False
-        self._road.update(
-            corrected,
-            localiser.downscale,
-            localiser.plane,
-            localiser.matrix,
-            outline if self._missed_frames == 0 else None,
-        )
+        covered = outline if self._missed_frames == 0 else None
+        self._road.update(corrected, localiser.downscale, localiser.plane, localiser.matrix, covered)
 
     def _change_ground_frame(self, estimate: Estimate) -> None:
         """Change to another ground frame where telemetry now gives a better one."""

@@ -48,20 +48,13 @@ class Origin:
         """Position (3,) north, east, down [m] of geodetic coordinates."""
         north, east = curvature_radii(self.latitude)
         across = (longitude - self.longitude + 180.0) % 360.0 - 180.0
-        return np.array(
-            [
-                math.radians(latitude - self.latitude) * north,
-                math.radians(across) * east * math.cos(math.radians(self.latitude)),
-                self.altitude - altitude,
-            ]
-        )
+        x = math.radians(latitude - self.latitude) * north
+        y = math.radians(across) * east * math.cos(math.radians(self.latitude))
+        return np.array([x, y, self.altitude - altitude])
 
     def to_geodetic(self, north: float, east: float, down: float) -> tuple[float, float, float]:
         """Latitude, longitude [degrees] and altitude [m] of a local position [m]."""
         a, b = curvature_radii(self.latitude)
         longitude = self.longitude + math.degrees(east / (b * math.cos(math.radians(self.latitude))))
-        return (
-            self.latitude + math.degrees(north / a),
-            (longitude + 180.0) % 360.0 - 180.0,
-            float(self.altitude - down),
-        )
+        longitude = (longitude + 180.0) % 360.0 - 180.0
+        return self.latitude + math.degrees(north / a), longitude, float(self.altitude - down)

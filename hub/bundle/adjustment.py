@@ -64,7 +64,7 @@ def adjust(
     for round_index in range(rounds):
         last = round_index == rounds - 1
         max_iterations = iterations if last else max(4, iterations // 3)
-        state = _minimise(problem, state, prior, robust, max_iterations, _COARSE_TOLERANCE, steps, coarse)
+        state = minimise(problem, state, prior, robust, max_iterations, _COARSE_TOLERANCE, steps, coarse)
         noise = residual_std(problem, state) if coarse else estimate_noise(problem, state, prior)
         state = replace(state, sigma=noise)
         prior = estimate_smoothness(problem, state)
@@ -74,7 +74,7 @@ def adjust(
         if progress is not None:
             progress(f"adjustment {round_index + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
     if not coarse:
-        state = _minimise(problem, state, prior, robust, iterations, _FINE_TOLERANCE, steps, coarse)
+        state = minimise(problem, state, prior, robust, iterations, _FINE_TOLERANCE, steps, coarse)
         state = replace(state, sigma=estimate_noise(problem, state, prior))
     return problem, replace(state, steps=tuple(steps)), prior
 
@@ -164,7 +164,7 @@ def apply_camera_step(camera: CameraState, step: Floats) -> CameraState:
     )
 
 
-def _minimise(
+def minimise(
     problem: Problem,
     state: AdjustmentState,
     prior: SmoothnessPrior,

@@ -29,6 +29,7 @@ from hub.trajectory.splines import SUPPORT
 from protocols.geometry.types import Floats, Ints
 
 _KNOTS_PER_TIME_CONSTANT, _MIN_KNOTS_PER_TIME_CONSTANT = 8.0, 2.0  # of a correlated error, per time constant
+_MAX_BRIDGE_VARIANCE = 0.01  # of the white noise: what a correlated error does between two knots without being missed
 _MAX_KNOT_SPACING_S = 5.0  # between two knots: unknowns that one row couples must be close together in the band
 _MAX_KNOTS = 15_000  # bounds time and memory
 _MAX_ROWS = 150_000  # the same
@@ -129,8 +130,11 @@ def _used(problem: Problem) -> list[TrackObservations]:
 
 
 def _time_constants(rows: TrackObservations, noise: CorrelatedNoise) -> float:
-    """Duration from the first row to the last, in time constants of the correlated error."""
-    return float(np.ptp(rows.time[rows.use])) / float(noise.time_constant[rows.camera])
+    """Duration from the first row to the last, in time constants of the correlated error; fewer of one so small that
+    the white noise hides what it does between knots further apart."""
+    share = float(noise.white_std[rows.camera] / noise.correlated_std[rows.camera]) ** 2
+    hidden = max(1.0, 3.0 * _KNOTS_PER_TIME_CONSTANT * _MAX_BRIDGE_VARIANCE * share)
+    return float(np.ptp(rows.time[rows.use])) / float(noise.time_constant[rows.camera]) / hidden
 
 
 def _on_trajectory(problem: Problem, state: AdjustmentState) -> Problem:

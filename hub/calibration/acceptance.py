@@ -7,9 +7,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from hub.bundle import covariance as cov
-from hub.bundle.initialisation import Reconstruction, inlier_share
-from hub.bundle.model_comparison import ScoreTest, refuted_lenses
-from hub.bundle.noise.correlated_noise import MIN_INFLATION
+from hub.bundle.initialisation import Reconstruction, inlier_share, sigma_limit
+from hub.bundle.model_comparison import LENS, ScoreTest, refuted_lenses
+from hub.bundle.noise.correlated_noise import MIN_INFLATION, lens_tolerance
 from hub.bundle.noise.noise_scale import correlation_inflation
 from hub.bundle.problem import FOCAL, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
@@ -57,8 +57,8 @@ def network_failure(
     """
     lens = wrong_lens(reconstruction.problem, reconstruction.state)
     if lens is not None:
-        name, source = "change of the given focal length, less three stds", "no zoom, crop or temperature changes more"
-        test = AcceptanceTest(name, _excess(lens), _WRONG_LENS, "relative", source, refuted_lens(lens))
+        name, source = "chi-squared of the given lens", "one in 10,000 rigs"
+        test = AcceptanceTest(name, lens.statistic, lens.limit, "", source, refuted_lens(lens))
         return reconstruction.names[lens.camera], test
     found = _covariance(reconstruction)
     groups = (
@@ -89,13 +89,21 @@ def wrong_lens(problem: Problem, state: AdjustmentState) -> ScoreTest | None:
         return None
     if correlation_inflation(problem, state).max() < MIN_INFLATION:
         return None
-    worst = max(refuted_lenses(problem, state), key=_excess, default=None)
-    return None if worst is None or _excess(worst) <= _WRONG_LENS else worst
+    far = [camera for camera, sigma in enumerate(state.sigma) if sigma > sigma_limit(state, camera)]
+    found = refuted_lenses(problem, state, LENS if far else LENS[:2])
+    worst = max(found, key=lambda one: _excess(one, problem, one.camera in far), default=None)
+    return None if worst is None or _excess(worst, problem, worst.camera in far) <= 1.0 else worst
 
 
-def _excess(test: ScoreTest) -> float:
-    """By how much a focal length differs from the given one, less three stds; relative."""
-    return abs(test.change) - 3.0 * test.std
+def _excess(test: ScoreTest, problem: Problem, far: bool) -> float:
+    """A focal length's change less three stds, over what no zoom, crop or temperature explains; where the residuals
+    are ``far`` larger than the others', also chi-squared of the lens beside its play in the field, over its limit."""
+    focal = float(abs(test.change[0]) - 3.0 * np.sqrt(test.covariance[0, 0])) / _WRONG_LENS
+    if not far:
+        return focal
+    field = lens_tolerance(problem.nominal[test.camera])
+    play = np.diag([field.focal_std, field.k1_std, field.centre_std, field.centre_std]) ** 2
+    return max(focal, float(test.change @ np.linalg.solve(test.covariance + play, test.change)) / test.limit)
 
 
 def _covariance(reconstruction: Reconstruction) -> cov.Covariance:

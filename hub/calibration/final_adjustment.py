@@ -38,6 +38,25 @@ def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem
     return problem, state
 
 
+def _with_fewer_steps(
+    even: tuple[Problem, AdjustmentState], found: tuple[Problem, AdjustmentState]
+) -> tuple[Problem, AdjustmentState]:
+    """What was ``found`` from ``even`` clocks; where all cameras but one step in it, the step of that one instead.
+
+    A step is the same as opposite ones of all other cameras, which are not to be preferred unless they explain more.
+    """
+    state, steps = found[1], found[1].clock_steps
+    alone = set(range(len(state.cameras))) - {one.camera for one in steps}
+    if len(steps) < 2 or len(alone) > 1:
+        return found
+    last, size = alone.pop(), -float(np.mean([one.size for one in steps]))
+    times = [state.cameras[one.camera].reference_time(np.array([one.time])) for one in steps]
+    same = (ClockStep(last, float(state.cameras[last].camera_time(one)[0]), size, np.inf, 0.0) for one in times)
+    best = max((_with_sizes(*even, one) for one in same), key=lambda tried: _gain(tried[0], tried[1], *even)[0])
+    supported = model_comparison.is_step_supported(best[0], best[1].clock_steps[-1])
+    return found if not supported or _bic_prefers(*found, *best, 2 * (len(steps) - 1)) else best
+
+
 def _steps_or_rates(
     even: tuple[Problem, AdjustmentState], found: tuple[Problem, AdjustmentState]
 ) -> tuple[Problem, AdjustmentState]:
@@ -114,13 +133,14 @@ def final_adjustment(
         if refitted[1] is not state:
             return replace(reconstruction, problem=refitted[0], state=refitted[1])
     if not online and any(one > sigma_limit(state, camera) for camera, one in enumerate(state.sigma)):
-        lens, step = wrong_lens(problem, state), model_comparison.find_clock_step(problem, state)
+        lens = wrong_lens(problem, state)
+        step = None if lens is None else model_comparison.find_clock_step(problem, state)
         if lens is not None and (step is None or step.statistic < lens.statistic):
             return reconstruction  # the camera will be left out
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
     if not (warm and online):
         even = problem, state
-        problem, state = _with_clock_steps(*even)
+        problem, state = _with_fewer_steps(even, _with_clock_steps(*even))
         problem, state = (problem, state) if online else _steps_or_rates(even, (problem, state))
     if not online and problem.free_parameters.clock:
         problem, state = _with_readouts(problem, state, report)

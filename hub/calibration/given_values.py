@@ -8,7 +8,7 @@ import numpy as np
 
 from hub.bundle.bordered_system import eliminate
 from hub.bundle.covariance import Covariance
-from hub.bundle.model_comparison import ScoreTest, refuted_lenses
+from hub.bundle.model_comparison import LENS, ScoreTest, refuted_lenses
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
@@ -22,11 +22,13 @@ _LENS_STD = 0.01
 
 def refuted_lens(test: ScoreTest) -> str:
     """What the observations say about a measured lens."""
-    change, std = 100 * test.change, 100 * test.std
+    change, std = test.change, np.sqrt(np.diag(test.covariance))
+    text = f"focal length {100 * change[0]:+.2g} % ± {100 * std[0]:.1g} % off, k1 {change[1]:+.2g} ± {std[1]:.1g}"
+    if len(std) > 2:
+        text += f", principal point ({change[2]:+.0f}, {change[3]:+.0f}) px ± {max(std[2:]):.1g} px"
     return (
-        "its measured lens is refuted by the observations, which give a focal length "
-        f"{change:+.2g} % ± {std:.1g} % off (chi-squared {test.statistic:.0f} for focal length and k1, "
-        f"limit {test.limit:.0f})"
+        f"its measured lens is refuted by the observations, which give a {text} "
+        f"(chi-squared {test.statistic:.0f}, limit {test.limit:.0f})"
     )
 
 
@@ -37,7 +39,7 @@ def refuted_lens_warnings(
     remedy = "correct it" if refine_lenses else "correct it, or estimate it with --refine-lenses"
     return tuple(
         f"{names[one.camera]}: {refuted_lens(one)}; it was kept as given: {remedy}"
-        for one in refuted_lenses(problem, state)
+        for one in refuted_lenses(problem, state) or refuted_lenses(problem, state, LENS[:2])
     )
 
 

@@ -5,8 +5,8 @@ of one bundle adjustment over all rows that are kept (asynchronous calibration p
 over lags and without incremental reconstruction). The same rows give the same answer as from scratch, because the
 adjustment converges to the same minimum; what it costs is linear in the rows.
 
-A camera is tied while its rows fit the trajectory that the others give. One whose newest rows do not, while its older
-ones did, was moved: its older rows are dropped, and it is located again by resection, at the clock that it had.
+A camera is tied while its rows fit the trajectory that the others give. The older rows of one that was moved
+(`moved_cameras`) are dropped, and it is located again by resection, at the clock that it had.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from hub.bundle.initialisation import (
 )
 from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, ClockStep, FreeParameters
-from hub.bundle.residuals import residual_norms
 from hub.calibration.acceptance import least_certain_camera, misfits
 from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, final_adjustment
+from hub.calibration.moved_cameras import moved_camera
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
 from hub.calibration.pipeline import calibrate
@@ -49,17 +49,10 @@ from hub.clocks.step_correction import (
 from hub.sync.hypothesis import PairSolution, evidence
 from protocols.core.clocks import CameraTime, TimeMap
 from protocols.core.errors import Refused
-from protocols.geometry.types import Bools
 from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
-_RECENT_S = 3.0
-"""Span of the newest rows that are tested for a moved camera [s]."""
-_MIN_RECENT_ROWS = 30  # before and after a move: as many as a camera of a network needs
-_MOVED_SHARE, _STEADY_SHARE = 0.4, 0.8
-"""A camera was moved where fewer of its newest rows than the first fit, while more of its older ones than the second
-do: of a camera that stands still 90 % and more fit."""
 _BETTER_KNOWN = 0.7  # a clock step is refined where its std falls below this share: twice the rows
 
 
@@ -103,11 +96,16 @@ def update_calibration(
         return Update(found if last is None else _in_published_clock(found, last), {})
     if last.reference in rig.cameras:
         rig = replace(rig, metadata={**rig.metadata, "reference": last.reference})
-    observations, last, start, steps = _with_clock_steps(rig, observations, last, full)
-    prepared, reconstruction = start
+    given = rig, observations, last, full
+    observations, last, (prepared, reconstruction), steps = _with_clock_steps(*given)
+    move = moved_camera(prepared, reconstruction)
+    if move is not None and any(camera.clock_steps != steps.get(name, ()) for name, camera in given[2].cameras.items()):
+        # A step explains a part of a move, while of what a step leaves two poses explain nothing.
+        observations, last, (prepared, reconstruction), steps = _with_clock_steps(*given, further=False)
+        move = moved_camera(prepared, reconstruction)
     refused = dict(prepared.refused)
-    moved = _moved_cameras(reconstruction, prepared)
     origins = prepared.time_origins
+    moved = {} if move is None else {move[0]: move[1][1] / prepared.time_scale(move[0]) + origins[move[0]]}
     if moved:
         observations = _without_older_rows(observations, moved)
         prepared = _with_estimated_lenses(rig, prepare(rig, observations), last)
@@ -172,12 +170,11 @@ def update_calibration(
 
 
 def _with_clock_steps(
-    rig: Rig, observations: Observations, last: Calibration, full: bool
+    rig: Rig, observations: Observations, last: Calibration, full: bool, further: bool = True
 ) -> tuple[Observations, Calibration, tuple[PreparedSession, Reconstruction], dict[str, tuple[Step, ...]]]:
     """Observations on the newest side of all clock steps, the last answer on it, the start from both, and the steps.
 
-    Steps that are known are corrected; a further one is, where that explains the rows better. It comes before the
-    question whether a camera was moved: a clock that steps has one parameter, a pose six.
+    Steps that are known are corrected; ``further`` ones are, where they explain the rows better.
     """
     steps = steps_inside(last, observations)
 
@@ -187,7 +184,7 @@ def _with_clock_steps(
         return prepared, _warm_start(prepared, _initial_states(prepared, last, tied, measured_lenses=full))
 
     prepared, reconstruction = start(steps, last)
-    for _ in range(MAX_CLOCK_STEPS + 1):
+    for _ in range(MAX_CLOCK_STEPS + 1 if further else 0):
         found = _clock_step(steps, prepared, reconstruction)
         if found is None:
             break
@@ -337,42 +334,6 @@ def _state_of(reconstruction: Reconstruction, name: str) -> CameraState:
 
 def _clock_of(state: CameraState) -> TimeMapEstimate:
     return TimeMapEstimate(state.rate, state.offset, state.centre)
-
-
-def _moved_cameras(reconstruction: Reconstruction, prepared: PreparedSession) -> dict[str, float]:
-    """Cameras whose newest rows contradict their older ones: by name, camera time [s] of the first that does.
-
-    Needs two other cameras: with one other, either may have moved.
-    """
-    if len(reconstruction.names) < 3:
-        return {}
-    out = {}
-    for number, name in enumerate(reconstruction.names):
-        times, fits = [], []
-        for rows in reconstruction.problem.rows:
-            if rows.camera == number:
-                norms = residual_norms(
-                    rows, reconstruction.state.cameras[number], reconstruction.state.trajectories[rows.label]
-                )
-                good = np.isfinite(norms)
-                times.append(rows.time[good])
-                fits.append(norms[good] < max(3.0, 5.0 * float(np.median(reconstruction.state.sigma))))
-        time, fit = np.concatenate(times), np.concatenate(fits)
-        order = np.argsort(time)
-        time, fit = time[order], fit[order]
-        recent = time > time[-1] - _RECENT_S if len(time) else np.zeros(0, dtype=np.bool_)
-        if recent.sum() < _MIN_RECENT_ROWS or (~recent).sum() < _MIN_RECENT_ROWS:
-            continue
-        if fit[recent].mean() < _MOVED_SHARE and fit[~recent].mean() > _STEADY_SHARE:
-            since = time[_change(fit)]
-            out[name] = float(since / prepared.time_scale(name) + prepared.time_origins[name])
-    return out
-
-
-def _change(fit: Bools) -> int:
-    """Index of the change from rows that fit to rows that do not: maximum likelihood of one change point."""
-    value = np.cumsum(np.where(fit, 1.0, -1.0))
-    return min(int(np.argmax(value)) + 1, len(fit) - 1)
 
 
 def _without_older_rows(observations: Observations, since: Mapping[str, float]) -> Observations:

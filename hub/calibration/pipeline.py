@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -23,14 +24,9 @@ from hub.bundle.noise.noise_scale import residual_std
 from hub.bundle.noise.timestamp_jitter import estimate_frame_times
 from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
-from hub.calibration.acceptance import (
-    LAG_CONFLICT,
-    CameraTests,
-    least_certain_camera,
-    misfits,
-    network_failure,
-)
+from hub.calibration.acceptance import LAG_CONFLICT, CameraTests, misfits, network_failure
 from hub.calibration.final_adjustment import final_adjustment
+from hub.calibration.moved_cameras import moved_cameras, without_moved
 from hub.calibration.pairs.pair_network import (
     Progress,
     coincide,
@@ -40,7 +36,7 @@ from hub.calibration.pairs.pair_network import (
     solve_pairs,
 )
 from hub.calibration.result import assemble_calibration, isolated_pair_report
-from hub.calibration.self_calibration import initial_self_calibration, with_updated_lenses
+from hub.calibration.self_calibration import LEAST_CAMERAS, initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
 from hub.calibration.unconnected import connect_by_resection, listed
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
@@ -138,6 +134,15 @@ def calibrate(
             solution = solve_with_unknown_lenses(
                 rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
             )
+        if thorough and solver == "joint" and known is None and not prepared.shared_clock:
+            moves = moved_cameras(solution, observations)
+            if moves:
+                found = calibrate(
+                    rig, without_moved(observations, moves), progress,
+                    thorough=True, clock_priors=clock_priors, refine_lenses=refine_lenses,
+                )  # fmt: skip
+                told = tuple(move.told(name) for name, move in moves.items())
+                return replace(found, warnings=(*found.warnings, *told))
         report("covariances", 0.95)
         return assemble_calibration(rig, solution, refine_lenses=refine_lenses)
     except Refused as refusal:
@@ -277,6 +282,7 @@ def solve_network(
     distributed_solver: places the cameras with pose nodes; None = incremental reconstruction and bundle adjustment.
     """
     refused = dict(prepared.refused)
+    final = partial(final_adjustment, report=report, online=online, refine_lenses=refine_lenses)
     free_parameters = FreeParameters(clock=not prepared.shared_clock)
     graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
     unfit, failures = set[str](), CameraTests()
@@ -292,7 +298,7 @@ def solve_network(
                 if placed.keys() == graph.clocks.keys()
                 else reconstruct_incrementally(*session, lambda text: report(text, 0.6), with_rate_prior)
             )
-            reconstruction = final_adjustment(reconstruction, report, online=online, refine_lenses=refine_lenses)
+            reconstruction = final(reconstruction, warm=bool(placed) and not (online or refine_lenses))
             # The narrow rate prior only stabilises the estimate; stds are computed with the usual one.
             usual = replace(reconstruction.problem.free_parameters, rate_std=free_parameters.rate_std)
             reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
@@ -323,7 +329,7 @@ def solve_network(
             reconstruction,
             unconnected,
             free_parameters,
-            lambda trial: final_adjustment(trial, report, online=online, refine_lenses=refine_lenses),
+            lambda trial: final(trial, warm=not (online or refine_lenses)),
             _misfit,
         )
         if more:
@@ -344,11 +350,12 @@ def solve_network(
 
 
 def _misfit(reconstruction: Reconstruction, name: str) -> str:
-    """Why a camera does not fit the others; "" if it does."""
-    failures = [failure for failure in misfits(reconstruction) if failure[0] == name]
-    certain = least_certain_camera(reconstruction) if not failures else None
-    failures += [certain] if certain is not None and certain[0] == name else []
-    return failures[0][1].reason if failures else ""
+    """Why a camera does not fit the others, or makes one of these fail, which passed without it; "" if it fits."""
+    own = [failure for failure in misfits(reconstruction) if failure[0] == name]
+    failure = own[0] if own else network_failure(reconstruction, (), {})
+    if failure is None or failure[0] == name:
+        return "" if failure is None else failure[1].reason
+    return f"with it {failure[0]} fails: {failure[1].reason}"
 
 
 def _rate_prior_std(graph: ClockGraph, usual: float) -> float:
@@ -437,7 +444,9 @@ def _largest_component(
     if not solved:
         reasons = refused | {name: _unplaced_reason(name, prepared, pairs) for name in names}
         refusal = Refused(_no_pair_reason(prepared, placeable, refused), in_rig_order(reasons, prepared))
-        refusal.permanent = len(prepared.cameras) < 2 and len(prepared.uncalibrated) > 0
+        refusal.permanent = (
+            len(prepared.uncalibrated) > 0 and len(prepared.cameras) < 2 and len(prepared.names) < LEAST_CAMERAS
+        )
         raise refusal
     groups = connected_components(names, solved)
     for name in [name for name in names if name not in groups[0]]:

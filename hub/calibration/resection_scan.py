@@ -27,10 +27,10 @@ from protocols.geometry.types import Floats
 
 _SAMPLES = 80
 """Points of a track, evenly along its path in the image: where the target rests, more of them tell nothing."""
-_MIN_POINTS = 16  # rows: more than the twelve unknowns of a linear resection
+MIN_POINTS = 16  # rows: more than the twelve unknowns of a linear resection
 _STEP_S = 0.1  # s: of the lag scan, refined afterwards
 _FINE_STEPS = 5  # finer by this factor, twice: to 4 ms
-_TRUNCATION_PX = 20.0
+TRUNCATION_PX = 20.0
 """Residual from which a point counts as not explained; so does one outside the trajectory."""
 _MIN_EXPLAINED = 0.3  # share of the truncated cost that the best lag has to remove
 _DISTINCT_S = 0.5  # s: nearer lags are one candidate
@@ -44,10 +44,10 @@ _SCALES = [np.array([mirror * scale, scale]) for mirror in (1.0, -1.0) for scale
 """Scales of an image about its centre, mirrored or not, that are tried where a camera fits at no lag: no view is so
 wide or narrow that a lens is mistaken by more."""
 _SCALE_STEPS = (1.04, 1.02, 1.01, 1.005)
-_LIKELY_CANDIDATES, _MIN_SCALE_CHANGE = 4, 0.03
+LIKELY_CANDIDATES, _MIN_SCALE_CHANGE = 4, 0.03
 """Candidates of the moment scan, which does not use the lens, whose scale is searched; scale that the lens gives."""
 _TRIMS = 2  # fits of a pose to the better half of the points
-_MIN_INLIERS, _MIN_CANDIDATE_RATIO = 0.8, 4.0
+MIN_INLIERS, MIN_CANDIDATE_RATIO = 0.8, 4.0
 """Share of the common rows that a time map without any bound from a clock has to explain, and cost of the next best."""
 
 
@@ -63,7 +63,7 @@ def scan_resection(
         for number, label in enumerate(reconstruction.labels)
         if isinstance(track := camera.tracks.get(label), SmoothTrack)
     ]
-    samples = [(number, *_along_path(track)) for number, track in tracks]
+    samples = [(number, *along_path(track)) for number, track in tracks]
     if not samples:
         return None, "no label that the others saw"
     state = CameraState(
@@ -82,7 +82,7 @@ def scan_resection(
         near = fine + step * np.arange(1 - _FINE_STEPS, _FINE_STEPS)
         near_costs = [_cost(samples, reconstruction, state, lag, focal) for lag in near]
         fine, best = float(near[int(np.argmin(near_costs))]), min(best, float(np.min(near_costs)))
-    if best > (1.0 - _MIN_EXPLAINED) * _TRUNCATION_PX**2:
+    if best > (1.0 - _MIN_EXPLAINED) * TRUNCATION_PX**2:
         return None, "its view of the trajectory agrees with no lag yet"
     other = float(costs[np.abs(lags - fine) > _DISTINCT_S].min(initial=np.inf))
     if abs(fine) > window:
@@ -92,7 +92,7 @@ def scan_resection(
     return replace(expected, offset=expected.offset + fine), ""
 
 
-def _along_path(track: ImageTrack) -> tuple[Floats, Floats]:
+def along_path(track: ImageTrack) -> tuple[Floats, Floats]:
     """Times (m,) and normalised points (m, 2) evenly along the track's path in the image."""
     steps = np.linalg.norm(np.diff(track.points, axis=0), axis=1)
     steps = np.minimum(steps, 3.0 * float(np.median(steps)) + 1e-12)  # false detections are long jumps
@@ -118,13 +118,13 @@ def _cost(
         image.append(points[good])
         count += len(time)
     positions, seen = np.concatenate(world), np.concatenate(image)
-    if len(positions) < _MIN_POINTS:
+    if len(positions) < MIN_POINTS:
         return float("inf")
-    residual = _resected_residuals(positions, seen, positions, seen, focal)
+    residual = resected_residuals(positions, seen, positions, seen, focal)
     if not np.isfinite(residual).any():
         return float("inf")
-    explained = np.minimum(residual, _TRUNCATION_PX) ** 2
-    return float((explained.sum() + (count - len(positions)) * _TRUNCATION_PX**2) / count)
+    explained = np.minimum(residual, TRUNCATION_PX) ** 2
+    return float((explained.sum() + (count - len(positions)) * TRUNCATION_PX**2) / count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ class TimeMapCandidate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _SeenLabel:
+class SeenLabel:
     """A label of the camera: its track, the path that the others give, and their times of it by camera."""
 
     track: SmoothTrack
@@ -147,7 +147,7 @@ class _SeenLabel:
     observed: list[Floats]
 
 
-_Sample: TypeAlias = tuple[_SeenLabel, Floats, Floats]
+Sample: TypeAlias = tuple[SeenLabel, Floats, Floats]
 """A label, and times (n,) and normalised points (n, 2) evenly along its track."""
 
 
@@ -168,35 +168,29 @@ def find_time_map(
 
     rates: the nominal one first; where no lag fits at it, the camera is also tried with other focal lengths.
 
-    The resection of every lag comes from the same sums over the rows (`_moment_scan`), so a rate costs as much as some
+    The resection of every lag comes from the same sums over the rows (`moment_scan`), so a rate costs as much as some
     correlations. The best candidates are verified by a calibrated resection, which has to be by far the best of all
     lags, to explain most of the common rows, and to predict either half of them from the other half. Where none does,
     the same is asked of candidates with a clock step.
     """
-    tracks = {label: track for label, track in camera.tracks.items() if isinstance(track, SmoothTrack)}
-    paths = reconstruction.state.trajectories
-    labels = [
-        _SeenLabel(tracks[label], paths[i], observation_times(reconstruction.problem, reconstruction.state, i))
-        for i, label in enumerate(reconstruction.labels)
-        if label in tracks
-    ]
+    labels = seen_labels(camera, reconstruction)
     if not labels:
         return None, "no label that the others saw"
-    moments, samples = _path_moments(labels), [(one, *_along_path(one.track)) for one in labels]
-    nominal = sorted(_moment_scan(labels, moments, rates[0]), key=lambda one: one.score)
-    verified = [_verify(one, samples, camera) for one in nominal[:_LIKELY_CANDIDATES]]
+    moments, samples = path_moments(labels), [(one, *along_path(one.track)) for one in labels]
+    nominal = sorted(moment_scan(labels, moments, rates[0]), key=lambda one: one.score)
+    verified = [verify(one, samples, camera) for one in nominal[:LIKELY_CANDIDATES]]
     if verified and _misfit(verified):
-        likely = nominal[:_LIKELY_CANDIDATES]
-        reason = _other_image([_verify(one, samples, camera, _SCALES) for one in likely])
+        likely = nominal[:LIKELY_CANDIDATES]
+        reason = _other_image([verify(one, samples, camera, _SCALES) for one in likely])
         if reason:
             return None, reason
-    found = [candidate for rate in rates[1:] for candidate in _moment_scan(labels, moments, rate)]
-    found = sorted([*found, *nominal[_LIKELY_CANDIDATES:]], key=lambda one: one.score)[: _CANDIDATES - len(verified)]
-    verified += [_verify(one, samples, camera) for one in found]
+    found = [candidate for rate in rates[1:] for candidate in moment_scan(labels, moments, rate)]
+    found = sorted([*found, *nominal[LIKELY_CANDIDATES:]], key=lambda one: one.score)[: _CANDIDATES - len(verified)]
+    verified += [verify(one, samples, camera) for one in found]
     if not verified:
         return None, "too little seen together with the other cameras"
     if reason := _misfit(verified):
-        likely = nominal[:_LIKELY_CANDIDATES]
+        likely = nominal[:LIKELY_CANDIDATES]
         verified += [one for candidate in likely for one in _verify_with_step(candidate, samples, camera)]
         if _misfit(verified):
             return None, reason
@@ -208,7 +202,17 @@ def find_time_map(
     return TimeMapEstimate(best.rate, best.rate * centre + best.offset, centre), reason
 
 
-def _path_moments(labels: list[_SeenLabel]) -> _PathMoments | None:
+def seen_labels(camera: CameraInput, reconstruction: Reconstruction) -> list[SeenLabel]:
+    """The labels of a camera whose path the others give."""
+    return [
+        SeenLabel(track, reconstruction.state.trajectories[i], observed)
+        for i, label in enumerate(reconstruction.labels)
+        if isinstance(track := camera.tracks.get(label), SmoothTrack)
+        for observed in [observation_times(reconstruction.problem, reconstruction.state, i)]
+    ]
+
+
+def path_moments(labels: list[SeenLabel]) -> _PathMoments | None:
     """Moments of the paths where two cameras saw them; None where that is nowhere."""
     begin, end = min(one.path.basis.begin for one in labels), max(one.path.basis.end for one in labels)
     time = np.asarray(begin + _STEP_S * np.arange(int((end - begin) / _STEP_S) + 1), dtype=np.float64)
@@ -223,8 +227,12 @@ def _path_moments(labels: list[_SeenLabel]) -> _PathMoments | None:
     return _PathMoments(begin, (homogeneous[:, :, first] * homogeneous[:, :, second]).transpose(2, 0, 1))
 
 
-def _moment_scan(labels: list[_SeenLabel], moments: _PathMoments | None, rate: float) -> list[TimeMapCandidate]:
+def moment_scan(
+    labels: list[SeenLabel], moments: _PathMoments | None, rate: float, later_half: bool | None = None
+) -> list[TimeMapCandidate]:
     """The best lags in each octave of support by the direct linear transform, from 40 correlations by FFT.
+
+    later_half: of the camera's rows only those in that half of its time; None = all.
 
     Over the camera matrix with rows p1, p2, p3 the squared image residual is that of p1 X - u p3 X and p2 X - v p3 X
     over (p3 X)². p1 and p2 follow from p3 (Schur complement), which leaves a generalised eigenvalue of order four.
@@ -234,7 +242,9 @@ def _moment_scan(labels: list[_SeenLabel], moments: _PathMoments | None, rate: f
     products, instants = moments.products, moments.products.shape[2]
     grid = grid_tracks([one.track.scaled(rate) for one in labels], _STEP_S, 0.5)
     u, v = grid.points[:, :, 0], grid.points[:, :, 1]
-    image = grid.weight * np.stack([np.ones_like(u), u, v, u**2 + v**2])
+    late = 2 * np.arange(u.shape[1]) >= u.shape[1]
+    weight = grid.weight if later_half is None else grid.weight * (late == later_half)
+    image = weight * np.stack([np.ones_like(u), u, v, u**2 + v**2])
     length = fast_length(instants + u.shape[1])
     spectra, others = rfft(products, length), np.conj(rfft(image, length))
     sums = np.stack([irfft(np.einsum("plm,lm->pm", spectra, one), length) for one in others])
@@ -296,11 +306,11 @@ class _Verified:
 
     @property
     def fits(self) -> bool:
-        return self.inliers >= _MIN_INLIERS and self.predicts
+        return self.inliers >= MIN_INLIERS and self.predicts
 
 
-def _common(
-    samples: list[_Sample], rate: float, offset: float, step: _Step | None = None
+def common_rows(
+    samples: list[Sample], rate: float, offset: float, step: _Step | None = None
 ) -> tuple[Floats, Floats, Floats]:
     """Positions (n, 3), image points (n, 2) and internal times (n,) of the rows where two others saw the path."""
     world, image, times = [], [], []
@@ -315,9 +325,9 @@ def _common(
     return np.concatenate(world), np.concatenate(image), np.concatenate(times)
 
 
-def _verify(
+def verify(
     candidate: TimeMapCandidate,
-    samples: list[_Sample],
+    samples: list[Sample],
     camera: CameraInput,
     scales: Sequence[Floats] = (),
     step: _Step | None = None,
@@ -326,15 +336,15 @@ def _verify(
 
     @lru_cache(maxsize=1)
     def common(offset: float) -> tuple[Floats, Floats, Floats]:
-        return _common(samples, candidate.rate, offset, step)
+        return common_rows(samples, candidate.rate, offset, step)
 
     def cost(offset: float, scale: Floats) -> float:
         positions, seen, _ = common(offset)
-        if len(positions) < _MIN_POINTS:
-            return _TRUNCATION_PX**2
+        if len(positions) < MIN_POINTS:
+            return TRUNCATION_PX**2
         seen, focal = seen * scale, camera.intrinsics.focal / float(scale[1])
-        residual = _resected_residuals(positions, seen, positions, seen, focal)
-        return float((np.minimum(residual, _TRUNCATION_PX) ** 2).mean())
+        residual = resected_residuals(positions, seen, positions, seen, focal)
+        return float((np.minimum(residual, TRUNCATION_PX) ** 2).mean())
 
     scale, offset = min(scales, key=lambda one: cost(candidate.offset, one), default=np.ones(2)), candidate.offset
     lowest = cost(offset, scale)
@@ -347,20 +357,20 @@ def _verify(
         scale = min((scale, scale * factor, scale / factor), key=lambda one: cost(offset, one))
     positions, seen, when = common(offset)
     seen, focal = seen * scale, camera.intrinsics.focal / float(scale[1])
-    if len(positions) < _MIN_POINTS:
-        return _Verified(candidate.rate, offset, scale, _TRUNCATION_PX**2, 0.0, False, step)
-    residual = _resected_residuals(positions, seen, positions, seen, focal)
+    if len(positions) < MIN_POINTS:
+        return _Verified(candidate.rate, offset, scale, TRUNCATION_PX**2, 0.0, False, step)
+    residual = resected_residuals(positions, seen, positions, seen, focal)
     late = when > np.median(when)
     halves = (
-        _resected_residuals(positions[part], seen[part], positions[~part], seen[~part], focal) for part in (late, ~late)
+        resected_residuals(positions[part], seen[part], positions[~part], seen[~part], focal) for part in (late, ~late)
     )
-    predicts = all(float(np.median(one)) < _TRUNCATION_PX for one in halves)
-    truncated = float((np.minimum(residual, _TRUNCATION_PX) ** 2).mean())
-    inliers = float((residual < _TRUNCATION_PX).mean())
+    predicts = all(float(np.median(one)) < TRUNCATION_PX for one in halves)
+    truncated = float((np.minimum(residual, TRUNCATION_PX) ** 2).mean())
+    inliers = float((residual < TRUNCATION_PX).mean())
     return _Verified(candidate.rate, offset, scale, truncated, inliers, predicts, step)
 
 
-def _verify_with_step(candidate: TimeMapCandidate, samples: list[_Sample], camera: CameraInput) -> list[_Verified]:
+def _verify_with_step(candidate: TimeMapCandidate, samples: list[Sample], camera: CameraInput) -> list[_Verified]:
     """The candidate with the clock step that fits best where either half of its rows gives pose and lag.
 
     A step is in one of the halves; the other one, which it does not touch, is of the longer part.
@@ -370,16 +380,16 @@ def _verify_with_step(candidate: TimeMapCandidate, samples: list[_Sample], camer
     order, middle, out = np.argsort(times, kind="stable"), float(np.median(times)), []
     for late in (False, True):
         half = [(label, time[part], at[part]) for label, time, at in samples for part in [(time >= middle) == late]]
-        placed = _verify(candidate, half, camera)
-        if placed.inliers < _MIN_INLIERS:
+        placed = verify(candidate, half, camera)
+        if placed.inliers < MIN_INLIERS:
             continue
         near = replace(candidate, offset=placed.offset)
-        pose, costs = _resect(*_common(half, near.rate, near.offset)[:2]), []
+        pose, costs = resect(*common_rows(half, near.rate, near.offset)[:2]), []
         for size in STEP_SIZES:
             moved = [label.path.at(near.rate * (time - size) + near.offset) for label, time, _ in samples]
             residual = _reprojection(pose, np.concatenate(moved), image, camera.intrinsics.focal)
-            costs.append(np.minimum(residual, _TRUNCATION_PX)[order] ** 2)
-        out.append(_verify(near, samples, camera, step=_Step(*best_split(times[order], np.array(costs))[:3])))
+            costs.append(np.minimum(residual, TRUNCATION_PX)[order] ** 2)
+        out.append(verify(near, samples, camera, step=_Step(*best_split(times[order], np.array(costs))[:3])))
     return out
 
 
@@ -388,7 +398,7 @@ def _misfit(verified: list[_Verified]) -> str:
     best, other = _best_and_next(verified)
     if not best.fits:
         return "its view of the path that the others agree on fits at no lag and no frame rate"
-    if best.cost * _MIN_CANDIDATE_RATIO > other:
+    if best.cost * MIN_CANDIDATE_RATIO > other:
         return f"another lag fits nearly as well (cost ratio {other / max(best.cost, 1e-9):.1f})"
     return ""
 
@@ -412,26 +422,26 @@ def _best_and_next(verified: list[_Verified]) -> tuple[_Verified, float]:
     others = (
         one.cost for one in verified if abs(one.rate - best.rate) > 1e-3 or abs(one.offset - best.offset) > _DISTINCT_S
     )
-    return best, min(others, default=_TRUNCATION_PX**2)
+    return best, min(others, default=TRUNCATION_PX**2)
 
 
-def _resected_residuals(positions: Floats, seen: Floats, others: Floats, others_seen: Floats, focal: float) -> Floats:
+def resected_residuals(positions: Floats, seen: Floats, others: Floats, others_seen: Floats, focal: float) -> Floats:
     """Residuals [px] of ``others`` under the pose that fits ``positions`` best; inf behind the camera.
 
     Where most of the points are not explained, the pose is fitted again to the better half: a few false detections far
     off displace a pose by more than the right one's residuals.
     """
-    pose = _resect(positions, seen)
+    pose = resect(positions, seen)
     for _ in range(_TRIMS):
         residual = _reprojection(pose, positions, seen, focal)
         typical = float(np.median(residual))
-        if typical < _TRUNCATION_PX or not np.isfinite(typical):
+        if typical < TRUNCATION_PX or not np.isfinite(typical):
             break
-        pose = _resect(positions[residual <= typical], seen[residual <= typical])
+        pose = resect(positions[residual <= typical], seen[residual <= typical])
     return _reprojection(pose, others, others_seen, focal)
 
 
-def _resect(positions: Floats, seen: Floats) -> tuple[Floats, Floats] | None:
+def resect(positions: Floats, seen: Floats) -> tuple[Floats, Floats] | None:
     """Rotation and shift of a camera by its view of points; None where there is none."""
     try:
         found, rotation, shift = cv2.solvePnP(positions, seen, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_SQPNP)

@@ -35,7 +35,7 @@ _PRINCIPAL_POINT_STD = 0.012  # of the larger image side: distance of principal 
 _K1_STD, _K2_STD = 0.15, 0.05  # priors of distortion: typical of lenses up to 100 degrees
 _SINGULAR_VALUE_NOISE = 0.02  # relative difference of the singular values due to noise
 _LOG_FOCAL_STARTS = (-0.5, -0.25, 0.0, 0.25, 0.5)  # of two prior stds from the prior mean of log focal length
-_MIN_CAMERAS = 3  # two unknown lenses are undetermined if the optical axes intersect
+LEAST_CAMERAS = 3  # two unknown lenses are undetermined if the optical axes intersect
 _FOCAL_TOLERANCE = 0.01  # relative change of the focal length below which it has converged,
 _PIXEL_TOLERANCE = 0.01  # px: likewise for the rms change of ball centres that it causes
 
@@ -53,7 +53,7 @@ def initial_self_calibration(
     if prepared.shared_clock or not names:
         return prepared, pairs
     without_nominal = sum(rig.cameras[name].intrinsics is None for name in names)
-    if without_nominal and len(connected) < _MIN_CAMERAS:
+    if without_nominal and len(connected) < LEAST_CAMERAS:
         return prepared, pairs
     priors = {name: focal_prior(rig, name) for name in names}
     focals = initial_focal_lengths(priors, {name: prepared.camera(name).intrinsics for name in connected}, solved)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 
 from hub.clocks.change_detector import ClockChange, ClockChangeDetector
@@ -54,24 +55,29 @@ class ClockSegments:
         if camera in self.alarms or len(self.alarms) < _MAX_ALARMS:
             self.alarms[camera] = f"the clock of {camera} stepped by {size:+.3f} s"
 
-    def to_present(self, calibration: Calibration, boots: dict[str, str]) -> tuple[Calibration, dict[str, str]]:
+    def to_present(
+        self, calibration: Calibration, boots: Mapping[str, str], until: Mapping[str, str] | None = None
+    ) -> tuple[Calibration, dict[str, str]]:
         """The calibration with every time map moved to its clock's present segment, and the names of these segments.
 
+        boots: segments of the maps that are given. until: segments to stop at, by camera.
         t_old = t_new - step - rate_change * (t_new - detected_at), from the time of detection on; the variance of the
         step is added to the offset's.
         """
         cameras, names = dict(calibration.cameras), dict(boots)
         for name, camera in calibration.cameras.items():
             rate, offset = camera.time_map.clock_rate, camera.time_map.time_offset
-            std = camera.time_offset_std
+            std, lag_time = camera.time_offset_std, camera.lag_time
             for change in self._detector.changes_since(name, boots.get(name, "")):
+                if until is not None and names.get(name) == until.get(name):
+                    break
                 offset -= rate * (change.step_s - change.rate_change * change.detected_at_s)
                 rate *= 1.0 - change.rate_change
-                std = math.hypot(std, change.step_std_s)
+                std, lag_time = math.hypot(std, change.step_std_s), lag_time + change.step_s
                 names[name] = change.segment
             if names.get(name) != boots.get(name):
                 time_map = TimeMap(time_offset=offset, clock_rate=rate)
-                cameras[name] = replace(camera, time_map=time_map, time_offset_std=std)
+                cameras[name] = replace(camera, time_map=time_map, time_offset_std=std, lag_time=lag_time)
         return replace(calibration, cameras=cameras), names
 
     def change_into(self, segment: str) -> ClockChange | None:

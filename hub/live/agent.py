@@ -133,6 +133,7 @@ class _HubAgent:
         self._began = time.monotonic()
         self._sequence, self._next_status, self._next_rig, self._next_progress = 0, 0.0, 0.0, 0.0
         self._last_action = ""
+        self._publish(hub.tick(self._began))  # what comes now has not waited since the machine began
 
     def _publisher(self, topic: Topic, rate_hz: float | None = None) -> Publisher:
         return self._stack.enter_context(closing(self._bus.publisher(topic, self._agent, rate_hz=rate_hz)))

@@ -448,11 +448,11 @@ class LiveHub:
         """The present answer with the cameras whose clock is still the one that the observations are on."""
         if self.calibration is None:
             return None
-        present, now_boots = self._in_present_segments(self.calibration)
-        kept = {name: camera for name, camera in present.cameras.items() if now_boots[name] == boots.get(name)}
+        then, found = self._in_present_segments(self.calibration, until=boots)
+        kept = {name: camera for name, camera in then.cameras.items() if found[name] == boots.get(name)}
         # Most of a large network in one search cost less than a search for each of them.
         begins_anew = len(boots) > LARGE_NETWORK and 2 * len(kept) < len(boots)
-        return replace(present, cameras=kept) if len(kept) > 1 and not begins_anew else None
+        return replace(then, cameras=kept) if len(kept) > 1 and not begins_anew else None
 
     def _take(self, answer: SolverAnswer, now: float) -> list[Message]:
         """Use an answer: the calibration that it gives, or why there is none."""
@@ -609,11 +609,13 @@ class LiveHub:
             self.nodes.handle(message)
         return [message]
 
-    def _in_present_segments(self, calibration: Calibration) -> tuple[Calibration, dict[str, str]]:
-        """The calibration in the clocks' present segments, and the boot ids of those."""
+    def _in_present_segments(
+        self, calibration: Calibration, until: Mapping[str, str] | None = None
+    ) -> tuple[Calibration, dict[str, str]]:
+        """The calibration in the clocks' present segments, or in those of ``until``, and the boot ids of them."""
         source = self._source()
         boots = {name: self._solved_boot_ids.get(name) or source.boot(name) for name in calibration.cameras}
-        return self.stream.clocks.to_present(calibration, boots)
+        return self.stream.clocks.to_present(calibration, boots, until)
 
 
 def without_camera(rig: Rig, observations: Observations, camera: str) -> tuple[Rig, Observations]:

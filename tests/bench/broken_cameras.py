@@ -3,8 +3,8 @@
     python -m tests.bench.broken_cameras [--cameras N] [--seconds S] [--seeds N] [--first SEED] [--session FOLDER]
 
 Each rig is calibrated without its last camera, with it as it is, and with it broken in one way after the other: rows
-labelled by another frame numbering, rows shuffled, another recording, a mirrored picture, a wrong lens (focal length
-1.3 times too long). CPU seconds are those of `calibrate`; change: the largest change of another camera's position or
+labelled by another frame numbering, rows shuffled, another recording, a mirrored or turned picture, wrong lenses, a
+camera that is moved. CPU seconds are those of `calibrate`; change: the largest change of another camera's position or
 lag, in its stated stds. Requirement: at most twice the CPU without it, named, changes below one std.
 --session: a recorded session instead of simulated ones, each of its cameras broken in turn.
 """
@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from hub.calibration.pipeline import calibrate
+from protocols.geometry import so3
 from protocols.geometry.types import Bools
 from protocols.session.calibration import Calibration
 from protocols.session.folder import read_folder
@@ -64,14 +65,45 @@ def mirrored(session: rigs.Session, name: str, mine: Bools, random: np.random.Ge
     return replace(session, pixels=pixels)
 
 
-def wrong_lens(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
-    """The focal length is given 1.3 times too long."""
+def wrong_lens(
+    session: rigs.Session, name: str, mine: Bools, focal: float, resized: float = 1.0, moved: float = 0.0
+) -> rigs.Session:
+    """The camera matrix is another one: a focal length, a picture of another size, a centre moved by a crop."""
     camera = session.rig.cameras[name]
     assert camera.intrinsics is not None
     matrix = camera.intrinsics.matrix.copy()
-    matrix[:2, :2] *= 1.3
+    matrix[:2, :2] *= focal
+    matrix[:2] *= resized
+    matrix[:2, 2] += moved * np.array(camera.size)
     wrong = replace(camera, intrinsics=replace(camera.intrinsics, matrix=matrix))
     return replace(session, rig=replace(session.rig, cameras=session.rig.cameras | {name: wrong}))
+
+
+def turned(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
+    """The picture is upside down: its lens then differs by twice what its centre is off."""
+    pixels = session.pixels.copy()
+    pixels[mine] = np.array(session.rig.cameras[name].size) - 1 - pixels[mine]
+    return replace(session, pixels=pixels)
+
+
+def fisheye(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
+    """The lens is a fisheye, given as a plain one."""
+    lens, pixels = session.rig.cameras[name].intrinsics, session.pixels.copy()
+    assert lens is not None
+    rays = np.column_stack([lens.unproject(pixels[mine]), np.ones(mine.sum())])
+    pixels[mine] = replace(lens, distortions=np.zeros(4), fisheye=True).project(rays)
+    return replace(session, pixels=pixels)
+
+
+def moved(session: rigs.Session, name: str, mine: Bools, random: np.random.Generator) -> rigs.Session:
+    """The camera is turned by 1° to 10° at a quarter to three quarters of the recording."""
+    lens, pixels = session.rig.cameras[name].intrinsics, session.pixels.copy()
+    assert lens is not None
+    after = mine & (session.time > np.quantile(session.time[mine], random.uniform(0.25, 0.75)))
+    axis = random.normal(size=3)
+    turn = so3.exp(np.deg2rad(10.0 ** random.uniform(0.0, 1.0)) * axis / np.linalg.norm(axis))
+    pixels[after] = lens.project(np.column_stack([lens.unproject(pixels[after]), np.ones(after.sum())]) @ turn.T)
+    return replace(session, pixels=pixels)
 
 
 BREAKAGES: dict[str, Breakage] = {
@@ -79,7 +111,14 @@ BREAKAGES: dict[str, Breakage] = {
     "shuffled": shuffled,
     "another recording": another_recording,
     "mirrored": mirrored,
-    "wrong lens": wrong_lens,
+    "wrong lens": lambda session, name, mine, _: wrong_lens(session, name, mine, 1.3),
+    "short lens": lambda session, name, mine, _: wrong_lens(session, name, mine, 0.7),
+    "half size": lambda session, name, mine, _: wrong_lens(session, name, mine, 1.0, 0.5),
+    "double size": lambda session, name, mine, _: wrong_lens(session, name, mine, 1.0, 2.0),
+    "crop": lambda session, name, mine, _: wrong_lens(session, name, mine, 1.0, moved=0.2),
+    "turned": turned,
+    "fisheye": fisheye,
+    "moved": moved,
 }
 
 

@@ -1,7 +1,7 @@
 """Any target in any view: cars, boats, bicycles and people in oblique video, also while the camera looks away.
 
     python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique]
-        [--first-seed 0] [--ranges 1,2.5,4] [--screens 0] [--light dusk] [--stabilisation] [--json]
+        [--first-seed 0] [--ranges 1,2.5,4] [--screens 0] [--covered] [--light dusk] [--stabilisation] [--json]
 
 Rendered oblique flights with truth, and where the data folder has them real ones: whole sequences, and windows that pan
 away from the target for 0.5 to 4 s and come back. No lens, no telemetry.
@@ -25,12 +25,13 @@ from edge.uav.image_motion.scene_motion import SceneMotion
 from protocols.geometry.types import Floats
 from tests.bench import uav_rivals
 from tests.bench.real_rigs import DEFAULT_DATA
-from tests.bench.uav_sequences import AWAY_S, Sequence, aerial, oblique, pan_away
+from tests.bench.uav_sequences import AWAY_S, Sequence, aerial, oblique, pan_away, share_inside
 from tests.support.oblique.world import FLIGHTS, TARGETS, ObliqueWorld
 
 MODELS = ("ground", *uav_rivals.NAMES)
 NEAR_PX, HELD_FRAMES = 20.0, 20
 _RATES = (10.0, 15.0, 30.0)
+_COVERED = (0.4, 0.85)  # share of a target that is seen in a first box that shows a screen before it
 _LEAST_PX = 4.0  # side of a target that the trackers take
 
 
@@ -121,8 +122,9 @@ def flight(
     frames: int | None = None,
     range_factor: float = 1.0,
     screens: int = 0,
+    covered: bool = False,
 ) -> Sequence:
-    """One rendered flight as a sequence; see ``ObliqueWorld``."""
+    """One rendered flight as a sequence; see ``ObliqueWorld``. covered: marked as it goes behind a screen."""
     seconds = 2.5 + 1.2 + away_s + 2.5 if path == "away" else 8.0
     count = round(seconds * rate) if frames is None else frames
     far = range_factor
@@ -131,21 +133,27 @@ def flight(
     box = np.array([(t.box.x, t.box.y, t.box.width, t.box.height) for _, t in pairs])
     visible = np.array([t.visible for _, t in pairs])
     first = int(np.argmax(visible >= 0.99))  # nobody can mark a target that is behind a house
+    if covered:
+        whole, goes = share_inside(box, (640, 360)) > 0.99, np.append(visible[1:], 1.0) <= visible
+        first = int(np.argmax((visible > _COVERED[0]) & (visible < _COVERED[1]) & whole & goes))
     kind = "rendered away" if path == "away" else "rendered"
     images = [image for image, _ in pairs[first:]]
     return Sequence(f"{target} {path} {seed}", kind, images, box[first:], rate, visible[first:])
 
 
-def rendered(seeds: range, ranges: list[float], kinds: list[str], screens: int = 0) -> Iterator[Sequence]:
+def rendered(
+    seeds: range, ranges: list[float], kinds: list[str], screens: int = 0, covered: bool = False
+) -> Iterator[Sequence]:
     """Rendered flights: every target, every flight, at 10 to 30 frames a second, the factors of the range in turn."""
     paths = [path for path in FLIGHTS if not kinds or ("rendered away" if path == "away" else "rendered") in kinds]
     for seed in seeds:
         for k, target in enumerate(TARGETS):
             for path in paths:
                 rate, away_s, factor = (of[(seed + k) % len(of)] for of in (_RATES, AWAY_S, ranges))
-                sequence = flight(target, path, 10 * seed + k, rate, away_s, None, factor, screens)
+                sequence = flight(target, path, 10 * seed + k, rate, away_s, None, factor, screens, covered)
+                least, most = _COVERED if covered else (0.99, 2.0)
                 # One that is behind a house all the time cannot be marked: its first box shows the house.
-                if sequence.box[0, 2:].min() >= _LEAST_PX and sequence.visible[0] >= 0.99:
+                if sequence.box[0, 2:].min() >= _LEAST_PX and least <= sequence.visible[0] < most:
                     yield sequence
 
 
@@ -232,6 +240,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--ranges", default="1", help="of rendered flights, over the usual range: 4 makes a car 12 px")
     parser.add_argument("--screens", type=int, default=0, help="trees and poles before the target, rendered flights")
+    parser.add_argument("--covered", action="store_true", help="mark the target as it goes behind one of them")
     parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
     parser.add_argument("--light", default="", help="change the images: dusk, haze, flicker")
     parser.add_argument("--stabilisation", action="store_true", help="only: how well the real videos are stabilised")
@@ -250,7 +259,8 @@ def main() -> None:
     sources: list[Iterator[Sequence]] = []
     if not kinds or any(kind.startswith("rendered") for kind in kinds):
         seeds = range(options.first_seed, options.first_seed + options.seeds)
-        sources.append(rendered(seeds, [float(factor) for factor in options.ranges.split(",")], kinds, options.screens))
+        ranges = [float(factor) for factor in options.ranges.split(",")]
+        sources.append(rendered(seeds, ranges, kinds, options.screens, options.covered))
     if not kinds or any(not kind.startswith("rendered") for kind in kinds):
         sources.append(real(options.data, not kinds or any("away" in kind for kind in kinds)))
     light = options.light

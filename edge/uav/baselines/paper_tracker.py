@@ -124,13 +124,9 @@ class PaperTracker:
             self._look(usable, track)
         observation = self._observation(usable, track)
         track.model.motion = track.diagnostics.motion
+        seen = observation if usable is not None else None
         track.particles = pf.step(
-            track.particles,
-            track.model,
-            observation if usable is not None else None,
-            self._rng,
-            resample_below=0.7,
-            number=track.number,
+            track.particles, track.model, seen, self._rng, resample_below=0.7, number=track.number
         )
         track.model.previous = observation
         state = self._state(observation, track)

@@ -45,14 +45,9 @@ class ColourModel:
     def propagate(self, states: Floats, rng: np.random.Generator) -> Floats:
         """Eqs. (2.3) to (2.5): motion by V along theta; V and theta are random walks."""
         x, y, speed, heading = states.T
-        return np.column_stack(
-            [
-                x + speed * np.cos(heading),
-                y + speed * np.sin(heading),
-                speed + rng.normal(0.0, self.speed_noise, len(states)),
-                heading + rng.normal(0.0, self.turn_noise, len(states)),
-            ]
-        )
+        faster, turn = (rng.normal(0.0, std, len(states)) for std in (self.speed_noise, self.turn_noise))
+        x, y = x + speed * np.cos(heading), y + speed * np.sin(heading)
+        return np.column_stack([x, y, speed + faster, heading + turn])
 
     def log_likelihood(self, states: Floats, observation: _ColourObservation) -> Floats:
         """Eqs. (2.7), (2.8)."""

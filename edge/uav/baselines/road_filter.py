@@ -62,12 +62,8 @@ class ArcModel:
 
         Deviation: the spline's position gets an error, or the filter could not return onto the lines.
         """
-        return np.column_stack(
-            [
-                rng.normal(0.0, _OFFSET_STD, len(states)),
-                states[:, 1] + rng.normal(0.0, self.curvature_noise, len(states)),
-            ]
-        )
+        offset, bend = (rng.normal(0.0, std, len(states)) for std in (_OFFSET_STD, self.curvature_noise))
+        return np.column_stack([offset, states[:, 1] + bend])
 
     def log_likelihood(self, states: Floats, observation: _ArcObservation) -> Floats:
         """Eqs. (3.6) to (3.8): exp(-lambda d^2), d^2 the mean squared distance of both white lines to the edges."""
@@ -165,13 +161,8 @@ class RoadFilter:
             for gap in gaps:
                 new = known + stride * np.arange(1.0, gap + 1.0)
                 lengths = np.concatenate([np.linspace(0.3 * known, known, 4), new[-3:]])
-                tried = pf.step(
-                    particles,
-                    model,
-                    _ArcObservation(edges, base, heading, half_width, lengths),
-                    self._rng,
-                    resample_below=1.0,
-                )
+                seen = _ArcObservation(edges, base, heading, half_width, lengths)
+                tried = pf.step(particles, model, seen, self._rng, resample_below=1.0)
                 state = pf.weighted_mean(tried.states, tried.weights)[None]
                 middle, normal = arcs(state, base, heading, new)
                 if not self._inside(middle[0, 0]):

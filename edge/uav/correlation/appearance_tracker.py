@@ -24,6 +24,7 @@ from edge.uav.correlation.scale import BoxFlow, ScaleFilter
 from edge.uav.correlation.search import search, tile
 from edge.uav.correlation.shape import Outline
 from edge.uav.correlation.velocity import VelocityFilter
+from edge.uav.image_motion.first_motion import FirstMotion
 from edge.uav.image_motion.residual import MovingParts
 from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
 from edge.uav.target.box import check_target_box
@@ -38,6 +39,8 @@ _COLOUR_SHARE = 0.5  # of its log likelihood ratio that the similarity and the f
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
 _MOVED = 2.0  # distance within which what moves is looked for, in target lengths
 _SLIP_STD = 0.35  # of a box that has slipped off its target, in target lengths: the two still overlap
+_STAYED = 0.3  # distance of a box from where its target has moved at first, in sides, at which it goes there
+_FIRST_STD = 0.2  # of that velocity, in lengths a second: a cell of a side within the first second
 _STANDS = -0.3  # log likelihood ratio below which a place stands and the target moves
 _WINDOW = 1.2  # half of the region that the filter sees, in target lengths
 _MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
@@ -96,6 +99,7 @@ class AppearanceTracker:
         self._belief = Belief()
         self._searching = False
         self._parts = MovingParts(image, self._time, self.box)
+        self._begun, self._first_motion = time, FirstMotion(image, self.box)
         return self._estimate(time)
 
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
@@ -113,6 +117,10 @@ class AppearanceTracker:
         image = self._scene.photometric.corrected(image)
         origin = self._predict(dt)
         self._parts.update(image, self._time, self.box, self.motion, place, origin)
+        self._first_motion.move(self.motion, self._scene.reach)
+        moved = self._first_motion.look(image, self._time - self._begun)
+        if moved is not None:
+            self._follow(*moved)
         if not self._searching:
             self._track(image, dt)
         else:
@@ -196,6 +204,13 @@ class AppearanceTracker:
                 self.box, self._other_std = box, expected.std
             if not self.motion.trusted:
                 self._sure = self.box, copy(self._motion_filter)
+
+    def _follow(self, place: OrientedBox, velocity: Floats) -> None:
+        """Go to where the target has surely moved, if the box has stayed with what its first box showed, too."""
+        if np.hypot(*((place.centre - self.box.centre) / place.sides)) > _STAYED:
+            self.box = place
+            self._motion_filter.restart(velocity, _FIRST_STD * self.length, self.length)
+            self._sure = place, copy(self._motion_filter)
 
     def _track(self, image: Image, dt: float) -> None:
         """Measure the target about its prediction."""

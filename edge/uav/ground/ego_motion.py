@@ -183,16 +183,11 @@ class EgoMotion:
         usable: Bools = np.asarray(np.isfinite(start).all(axis=1))
         begin = np.where(usable[:, None], start, self._pixels).astype(np.float32)
         begin = np.clip(begin, -50.0, [width + 50.0, height + 50.0]).astype(np.float32)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.02)
+        window, flags = (_LK_WINDOW, _LK_WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
+        old, new = self._pixels[:, None], begin[:, None].copy()
         found, status, _ = cv2.calcOpticalFlowPyrLK(
-            self._gray,
-            gray,
-            self._pixels[:, None],
-            begin[:, None].copy(),
-            winSize=(_LK_WINDOW, _LK_WINDOW),
-            maxLevel=levels,
-            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.02),
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            minEigThreshold=2e-4,
+            self._gray, gray, old, new, None, None, window, levels, criteria, flags, minEigThreshold=2e-4
         )
         at = np.asarray(found, dtype=np.float32).reshape(-1, 2)
         inside = (at > 3.0).all(axis=1) & (at[:, 0] < width - 4) & (at[:, 1] < height - 4)

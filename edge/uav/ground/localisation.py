@@ -127,14 +127,9 @@ class CameraLocaliser:
                 if earlier is not None and telemetry.rate_hz > 8.0 and telemetry.offset_std < _CONVERGED_STD_S:
                     rotation_step = measured @ earlier.T
                     predicted = PlanePose(rotation_step @ pose.rotation, self._ego.predicted_centre(dt))
+        grey, factor = _to_grey(working), 1.0 if predicted is None else 0.6
         self._ego.update(
-            _to_grey(working),
-            dt,
-            excluded=excluded,
-            predicted=predicted,
-            std_factor=1.0 if predicted is None else 0.6,
-            attitude=attitude,
-            position=position,
+            grey, dt, excluded=excluded, predicted=predicted, std_factor=factor, attitude=attitude, position=position
         )
         self.photometric.update(working, *self._ego.correspondences)
         if telemetry is not None and isinstance(self._ego.pose, PlanePose) and self._ego.frames_without_pose == 0:

@@ -111,20 +111,16 @@ def initialise(position: Floats, std: float, count: int, rng: np.random.Generato
     """Particles about a position (2,) with unknown motion."""
     zeros = np.zeros(count)
     positions, headings = position + rng.normal(0.0, std, (count, 2)), rng.uniform(-np.pi, np.pi, count)
-    speed = np.abs(rng.normal(0.0, 14.0, count))
-    return ParticleSet(
-        positions,
-        headings,
-        speed,
-        zeros,
-        zeros,
-        np.full(count, NO_PATH),
-        zeros,
-        zeros,
-        speed,
-        np.full(count, _LATERAL_LIMIT),
-        np.full(count, 1.0 / count),
-    )
+    return _off_paths(positions, headings, np.abs(rng.normal(0.0, 14.0, count)), zeros, zeros)
+
+
+def _off_paths(
+    position: Floats, heading: Floats, speed: Floats, acceleration: Floats, curvature: Floats
+) -> ParticleSet:
+    """Particles that follow no path."""
+    zeros, path, limit = 0.0 * speed, np.full(len(speed), NO_PATH), np.full(len(speed), _LATERAL_LIMIT)
+    weights = np.full(len(speed), 1.0 / len(speed))
+    return ParticleSet(position, heading, speed, acceleration, curvature, path, zeros, zeros, speed, limit, weights)
 
 
 def sample_from_fit(
@@ -140,25 +136,15 @@ def sample_from_fit(
     persistence: share of the acceleration that persists.
     """
     velocity = fit.velocity + rng.normal(0.0, fit.velocity_std, (count, 2))
-    speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    heading = np.arctan2(velocity[:, 1], velocity[:, 0])
     shrink = 1.0 / (1.0 + np.square(fit.acceleration_std / max(2.0, 0.17 * fit.speed)))
-    acceleration = persistence * shrink * fit.longitudinal_acceleration + rng.normal(
-        0.0, min(fit.acceleration_std, 1.0), count
-    )
-    curvature = np.full(count, fit.turn_rate / max(fit.speed, 2.0)) + rng.normal(0.0, 0.01, count)
-    return ParticleSet(
+    noise = rng.normal(0.0, min(fit.acceleration_std, 1.0), count)
+    curvature = np.clip(fit.turn_rate / max(fit.speed, 2.0) + rng.normal(0.0, 0.01, count), -0.15, 0.15)
+    return _off_paths(
         position + rng.normal(0.0, std, (count, 2)),
-        heading,
-        speed,
-        acceleration,
-        np.clip(curvature, -0.15, 0.15),
-        np.full(count, NO_PATH),
-        np.zeros(count),
-        np.zeros(count),
-        speed,
-        np.full(count, _LATERAL_LIMIT),
-        np.full(count, 1.0 / count),
+        np.arctan2(velocity[:, 1], velocity[:, 0]),
+        np.hypot(velocity[:, 0], velocity[:, 1]),
+        persistence * shrink * fit.longitudinal_acceleration + noise,
+        curvature,
     )
 
 

@@ -23,13 +23,8 @@ def assign_paths(particles: ParticleSet, paths: list[RoadPath], share: float, rn
     drawn_path = np.minimum(np.searchsorted(edges, rng.random(n)), len(paths) - 1)
     free = rng.random(n) >= share
     curvature = np.where(free, particles.curvature, rng.normal(0.0, _UNKNOWN_CURVATURE_STD, n))
-    return replace(
-        particles,
-        path=np.where(free, NO_PATH, drawn_path),
-        arc_length=arc_length,
-        lateral_offset=lateral_offset,
-        curvature=curvature,
-    )
+    path = np.where(free, NO_PATH, drawn_path)
+    return replace(particles, path=path, arc_length=arc_length, lateral_offset=lateral_offset, curvature=curvature)
 
 
 def reassign_paths(

@@ -156,16 +156,10 @@ class MotionHistory:
         residual = float(np.sqrt(0.5 * np.mean(np.square(error))))
         inflate = max(1.0, float(np.sqrt(0.5 * np.mean(np.square(error / stds)))))
         covariance = np.linalg.inv(normal) * inflate**2
-        found = MotionFit(
-            float(times[-1]),
-            solution[0],
-            solution[1],
-            solution[2],
-            float(np.sqrt(covariance[1, 1])),
-            float(np.sqrt(covariance[2, 2])),
-            residual,
-            len(t),
-        )
+        position, velocity, acceleration = solution[:3]
+        of_velocity, of_acceleration = (float(np.sqrt(covariance[k, k])) for k in (1, 2))
+        time, count = float(times[-1]), len(t)
+        found = MotionFit(time, position, velocity, acceleration, of_velocity, of_acceleration, residual, count)
         self._fits.append(found)
         return found
 

@@ -85,23 +85,13 @@ class Target:
 
     def patch(self, image: Image, centre: Floats, half: float, angle: float | None = None) -> GroundPatch | None:
         """A rectified patch about a ground point (2,), ``half`` target lengths to each side; None if not in view."""
-        half_size = min(half * self.length, _MAX_HALF_CELLS * self.appearance.cell_size)
-        orientation = self.angle if angle is None else angle
-        localiser = self._localiser
-        patch = rectify_patch(
-            image,
-            localiser.plane,
-            localiser.target_matrix,
-            centre,
-            orientation,
-            (half_size, half_size),
-            self.appearance.cell_size,
-        )
-        return (
-            None
-            if patch is None
-            else replace(patch, cells=localiser.photometric.corrected(patch.cells, self.local_gain.log_gain))
-        )
+        localiser, cell = self._localiser, self.appearance.cell_size
+        sides = (min(half * self.length, _MAX_HALF_CELLS * cell),) * 2
+        angle = self.angle if angle is None else angle
+        patch = rectify_patch(image, localiser.plane, localiser.target_matrix, centre, angle, sides, cell)
+        if patch is None:
+            return None
+        return replace(patch, cells=localiser.photometric.corrected(patch.cells, self.local_gain.log_gain))
 
     def update_resolution(self, position: Floats) -> None:
         """Adapt scale and cell size to the resolution at the target's position."""

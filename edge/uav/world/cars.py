@@ -31,18 +31,8 @@ COLOURS_BGR = {
 
 def _chamfered(back: float, front: float, half: float, cut: float) -> Floats:
     """Rectangle with chamfered corners: an octagon (8, 2) forward, right [m]."""
-    return np.array(
-        [
-            (front, -half + cut),
-            (front, half - cut),
-            (front - cut, half),
-            (back + cut, half),
-            (back, half - cut),
-            (back, -half + cut),
-            (back + cut, -half),
-            (front - cut, -half),
-        ]
-    )
+    right = [(front, half - cut), (front - cut, half), (back + cut, half), (back, half - cut)]
+    return np.array([(front, -half + cut), *right, (back, -half + cut), (back + cut, -half), (front - cut, -half)])
 
 
 _BODY = _chamfered(-LENGTH / 2, LENGTH / 2, WIDTH / 2, 0.32)

@@ -75,24 +75,13 @@ def sample_disturbance(
     """Draw disturbances: constant tilt, coloured tilt and yaw noise, vibration, coloured position noise."""
     step, n = 1.0 / GRID_HZ, len(times)
     tilt = np.deg2rad(rng.normal(0.0, mean_tilt_deg, 2))
-    angles = np.column_stack(
-        [
-            *(
-                tilt[axis] + smoothed_noise(rng, n, step, np.deg2rad(levels.tilt_deg), levels.tilt_s)
-                for axis in range(2)
-            ),
-            smoothed_noise(rng, n, step, np.deg2rad(levels.yaw_deg), levels.yaw_s),
-        ]
-    )
+    turns = [(levels.tilt_deg, levels.tilt_s)] * 2 + [(levels.yaw_deg, levels.yaw_s)]
+    angles = np.column_stack([smoothed_noise(rng, n, step, np.deg2rad(size), seconds) for size, seconds in turns])
+    angles[:, :2] += tilt
     for axis in range(3):
         angles[:, axis] += smoothed_noise(rng, n, step, np.deg2rad(levels.vibration_deg), 0.015)
-    shift = np.column_stack(
-        [
-            *(smoothed_noise(rng, n, step, levels.position_m, levels.position_s) for _ in range(2)),
-            smoothed_noise(rng, n, step, levels.altitude_m, levels.altitude_s),
-        ]
-    )
-    return Disturbance(angles, shift)
+    moves = [(levels.position_m, levels.position_s)] * 2 + [(levels.altitude_m, levels.altitude_s)]
+    return Disturbance(angles, np.column_stack([smoothed_noise(rng, n, step, *move) for move in moves]))
 
 
 def flight_over(

@@ -64,16 +64,9 @@ class FlightRenderer:
         """
         size = (self._lens.width, self._lens.height)
         flat = matrix[:, [0, 1, 3]]
-        image = np.asarray(
-            cv2.warpPerspective(
-                self._town.ground.image,
-                flat @ self._town.ground.ground_from_pixel,
-                size,
-                flags=cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_REPLICATE,
-            ),
-            np.uint8,
-        )
+        ground, mode = self._town.ground, cv2.BORDER_REPLICATE
+        warped = cv2.warpPerspective(ground.image, flat @ ground.ground_from_pixel, size, borderMode=mode)
+        image = np.asarray(warped, np.uint8)
         middle, radius = self._footprint(flat)
         for car in self._town.parked:
             if np.abs(car.ground[0] - middle).max() < radius:

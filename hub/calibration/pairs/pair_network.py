@@ -47,6 +47,8 @@ _FEW_CANDIDATES = 2
 """Lags that are refined, while none of them is reliable, for a camera that resection can still find: in 48 of 48 pairs
 of 12 simulated and 2 real rigs the first one was reliable, and a camera that is broken costs a search of all 18."""
 _MIN_CONTRADICTIONS = 2  # pairs that refute the only other pair of a camera
+_MAX_PAIR_NOISE = 2.0
+"""Median residual of a camera's pairs, over that of the best pairs of all: above it its lens may be wrong."""
 _MAX_PRIOR_WINDOW = 0.5  # s on either side: a less precise prior selects nothing
 
 
@@ -97,7 +99,10 @@ def solve_pairs(
                 pairs[a, b] = solution
                 continue
         predicted_lag = None if prepared.shared_clock else synchronised.lag(prepared, a, b)
-        if thorough == "first pair" and predicted_lag is None and synchronised.leaves(a, b, pairs.values()):
+        # A pair that was not searched completely is left as it is if by now others connect three cameras.
+        is_done = (a, b) in pairs and max(synchronised.size(a), synchronised.size(b)) >= _MIN_REDUNDANT
+        may_leave = thorough == "first pair" and predicted_lag is None
+        if is_done or (may_leave and synchronised.leaves(a, b, pairs.values())):
             unsearched = PairSolution(a, b, "not searched: the most promising pair of the same camera had failed")
             pairs.setdefault((a, b), unsearched)
             continue
@@ -250,19 +255,19 @@ class _SynchronisedGroups:
 
     def __init__(self) -> None:
         self._maps: dict[str, tuple[str, float, float]] = {}
-        self._pairs: Counter[str] = Counter()
+        self._residuals: dict[str, list[float]] = {}
 
     def has_enough(self, a: str, b: str) -> bool:
         """Whether two cameras are in one group, and each in pairs that check each other."""
         one, other = (self._maps.get(name, ("", 0.0, 0.0))[0] for name in (a, b))
-        return bool(one) and one == other and min(self._pairs[a], self._pairs[b]) > _ENOUGH_PAIRS
+        return bool(one) and one == other and all(len(self._residuals[name]) > _ENOUGH_PAIRS for name in (a, b))
 
     def add(self, pair: PairSolution) -> None:
         """Merge the groups of a solved pair's cameras; a pair within one group changes nothing."""
         if not pair.solved or pair.fit is None:
             return
         for name in (pair.a, pair.b):
-            self._pairs[name] += 1
+            self._residuals.setdefault(name, []).append(pair.fit.residual_px)
             self._maps.setdefault(name, (name, 1.0, 0.0))
         (group_a, rate_a, offset_a), (group_b, rate_b, offset_b) = self._maps[pair.a], self._maps[pair.b]
         if group_a == group_b:
@@ -280,14 +285,19 @@ class _SynchronisedGroups:
         return sum(other == group for other, _, _ in self._maps.values())
 
     def leaves(self, a: str, b: str, pairs: Iterable[PairSolution]) -> bool:
-        """Whether one of two cameras is in a group of three or more, and the other's best pair with it has failed."""
+        """Whether one of two cameras is in a group of three or more, and the other's best pair with it has failed.
+
+        A failed pair with a camera whose own pairs fit far worse than the others' says nothing about the new one.
+        """
         groups = Counter(group for group, _, _ in self._maps.values())
+        most = _MAX_PAIR_NOISE * np.median([min(pixels) for pixels in self._residuals.values()] or [np.inf])
         for new, old in ((a, b), (b, a)):
             group = self._maps.get(old, ("", 1.0, 0.0))[0]
             if new in self._maps or groups[group] < _MIN_REDUNDANT:
                 continue
             tried = [pair.b if pair.a == new else pair.a for pair in pairs if new in (pair.a, pair.b)]
-            if any(self._maps.get(other, ("", 1.0, 0.0))[0] == group for other in tried):
+            inside = [other for other in tried if self._maps.get(other, ("", 1.0, 0.0))[0] == group]
+            if any(np.median(self._residuals[other]) <= most for other in inside):
                 return True
         return False
 

@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import coo_array, csr_array
 
 from deploy.agents.malloc_tuning import retain_freed_memory
-from hub.bundle.adjustment import _minimise, apply_step
+from hub.bundle.adjustment import apply_step, minimise
 from hub.bundle.bordered_system import THIRD_DIFFERENCE, third_differences
 from hub.bundle.initialisation import _camera_state, triangulate_and_adjust
 from hub.bundle.normal_equations import build_system
@@ -129,7 +129,7 @@ def _onto_x(direction: Floats) -> Floats:
 
 def ours(task: Task) -> AdjustmentState:
     """The same loop as `adjust` runs, to its fine end."""
-    return _minimise(task.problem, task.start, task.prior, False, 40, 1e-7, [], False)
+    return minimise(task.problem, task.start, task.prior, False, 40, 1e-7, [], False)
 
 
 class Stacked:

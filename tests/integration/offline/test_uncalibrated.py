@@ -146,6 +146,14 @@ def test_two_cameras_that_cannot_be_placed_are_refused_with_their_timing(
     assert "<h2>Pairs</h2>" in page
 
 
+@pytest.mark.parametrize(("cameras", "permanent"), [(2, True), (3, False)])
+def test_a_refusal_lasts_only_where_more_rows_cannot_determine_the_lenses(cameras: int, permanent: bool) -> None:
+    session = without_lenses(simulate(2, cameras, 4), *(f"cam{n}" for n in range(cameras)))
+    with pytest.raises(Refused) as caught:
+        calibrate(session.rig, session.observations())
+    assert caught.value.permanent == permanent
+
+
 def test_an_uncalibrated_camera_that_saw_another_object_is_not_timed(tmp_path: Path) -> None:
     session = without_lenses(simulate(2, 3, 20, unrelated=(1,)), "cam1")
     status, result = solve(session, tmp_path)

@@ -19,6 +19,7 @@ from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.correlation.redetection import Prediction, Redetection
 from edge.uav.correlation.velocity import VelocityFilter
+from edge.uav.image_motion.first_motion import FirstMotion
 from edge.uav.image_motion.residual import UNKNOWN, MovingParts, Residual
 from edge.uav.image_motion.scene_motion import Motion, SceneMotion
 
@@ -277,6 +278,51 @@ def test_that_the_target_moves_is_learnt_where_it_was_at_first(scene: Image) -> 
     _, residual, _ = watched(scene, 5.0, follows=False)
     assert residual.moves > 0.6
     assert residual.log_ratio(np.array([120.0 - 56.0, 120.0])) < 0.0  # where the box is
+
+
+def behind_a_tree(scene: Image, place: np.ndarray) -> Image:
+    """The target about ``place`` with a green tree before it, that stands where half of the first box shows it."""
+    image = painted(scene, place)
+    cv2.circle(image, (82, 128), 14, (30, 90, 40), -1)
+    cv2.circle(image, (88, 120), 9, (40, 120, 60), -1)
+    return image
+
+
+def test_the_first_motion_is_of_what_moves_also_where_a_tree_fills_half_of_the_box(scene: Image) -> None:
+    start = np.array([70.0, 120.0])
+    first = FirstMotion(behind_a_tree(scene, start), OrientedBox(*start, *map(float, TARGET)))
+    still = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), True, 1.0)
+    looks = []
+    for k in range(1, 16):
+        first.move(still, 100.0)
+        looks.append(first.look(behind_a_tree(scene, start - [2.0 * k, 0.0]), k / FPS))
+    place, velocity = next(look for look in looks if look is not None)
+    k = next(k for k, look in enumerate(looks, 1) if look is not None)
+    assert np.hypot(*(place.centre - start + [2.0 * k, 0.0])) < 0.25 * TARGET[0]
+    assert np.abs(velocity - [-30.0, 0.0]).max() < 0.35 * TARGET[0]
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["it stands", "the scene's motion is lost"])
+def test_of_what_stands_or_of_a_scene_that_is_lost_there_is_no_first_motion(scene: Image, known: bool) -> None:
+    start = np.array([70.0, 120.0])
+    first = FirstMotion(behind_a_tree(scene, start), OrientedBox(*start, *map(float, TARGET)))
+    step = np.zeros(2) if known else np.array([-2.0, 0.0])
+    for k in range(1, 20):
+        first.move(Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), known, 1.0), 100.0)
+        assert first.look(behind_a_tree(scene, start + k * step), k / FPS) is None
+
+
+def test_a_box_that_stays_with_the_tree_before_it_goes_to_where_its_target_has_moved(
+    scene: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = np.array([70.0, 120.0])
+    tracker = AppearanceTracker(SIZE, FPS)
+    tracker.begin(behind_a_tree(scene, start), 0.0, Box(*(start - 0.5 * TARGET), *map(float, TARGET)))
+    gone = OrientedBox(*(start - [12.0, 0.0]), *map(float, TARGET))
+    monkeypatch.setattr(tracker._first_motion, "look", lambda image, seconds: (gone, np.array([-30.0, 0.0])))
+    found = tracker.handle_frame(behind_a_tree(scene, gone.centre), 0.4)
+    assert abs(found.x - gone.x) < 4.0
+    assert tracker._motion_filter.velocity[0] < -20.0
 
 
 def test_while_the_target_is_beyond_the_border_a_place_needs_higher_odds() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from hub.bundle import gls
 from hub.bundle.adjustment import adjust, apply_step
 from hub.bundle.block_matrix import DenseCovariance
 from hub.bundle.covariance import CameraCovariance, covariance
@@ -150,6 +151,17 @@ def test_the_cost_is_the_mahalanobis_distance_by_the_errors_covariance() -> None
         expected += float((off * np.linalg.solve(dense(rows.time, WHITE, CORRELATED, TIME_CONSTANT), off)).sum())
     assert gls_cost(problem, state, plain, true_noise()) == pytest.approx(expected, rel=0.1)
     assert expected == pytest.approx(2.0 * CAMERAS * RATE * SECONDS, rel=0.1)
+
+
+def test_a_correlated_error_that_the_white_noise_hides_needs_few_knots(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, state = rig(1)
+    prior = estimate_smoothness(problem, state)
+    hidden = CorrelatedNoise(np.full(CAMERAS, WHITE), np.full(CAMERAS, 0.1 * WHITE), np.full(CAMERAS, 0.1))
+    few, cost = gls._noise_blocks(problem, hidden), gls_cost(problem, state, prior, hidden)
+    monkeypatch.setattr(gls, "_MAX_BRIDGE_VARIANCE", 0.0)
+    many = gls._noise_blocks(problem, hidden)
+    assert 10 * sum(len(block.knots) for block in few) < sum(len(block.knots) for block in many)
+    assert cost == pytest.approx(gls_cost(problem, state, prior, hidden), rel=0.03)
 
 
 def test_every_step_from_the_optimum_increases_the_cost() -> None:

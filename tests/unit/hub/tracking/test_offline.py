@@ -225,6 +225,28 @@ def test_what_lies_between_two_exchanged_tracks_is_associated_anew(monkeypatch: 
     assert smoother._changed[4:7].all()
 
 
+@pytest.mark.parametrize("exchanged_at", [5, None])
+def test_two_neighbours_get_the_futures_that_their_detections_support(
+    exchanged_at: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two walk side by side at 2 Hz; their tracks are exchanged at one scan, or at none."""
+    rng = np.random.default_rng(0)
+    place = np.array([[-0.4, 0.0], [0.4, 0.0]]) + 0.5 * np.arange(12)[:, None, None] * np.array([0.0, 1.0])
+    messages, calibration = boxes(rng, place - [0.0, 2.75], cameras=4, height=3.0)
+    made: list[BatchSmoother] = []
+    monkeypatch.setattr(BatchSmoother, "run", lambda self, **_: made.append(self) or [])
+    follow(messages, calibration, [0], up=UP)
+    (smoother,) = made
+    for index in range(len(smoother.scans) if exchanged_at is None else exchanged_at, len(smoother.scans)):
+        smoother._rename(index, np.array([1, 0]))
+    forward, backward = smoother._filter(1), smoother._filter(-1)
+    for index in range(3, 9):
+        follows = smoother._more_probable_futures(forward[index], backward[index], np.arange(2), index)
+        # Before the exchange too: the detections of that scan are divided anew between the two.
+        near = exchanged_at is not None and index in (exchanged_at - 1, exchanged_at)
+        assert follows.tolist() == ([1, 0] if near else [0, 1])
+
+
 def test_an_exchange_on_which_all_cameras_of_a_scan_agree_is_undone_as_a_whole() -> None:
     """Two walk side by side at 2 Hz; in the last scan every camera has taken each for the other."""
     rng = np.random.default_rng(0)

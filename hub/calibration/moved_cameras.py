@@ -1,0 +1,166 @@
+"""Cameras that were moved during a recording: their rows on one side of that are left out.
+
+A camera was moved where, at one and the same lag, its rows before and after some time each have a pose that explains
+them, and both poses by far more than one does: a wrong lag or lens and a clock that steps are no better off with two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hub.bundle.initialisation import CameraInput, Reconstruction
+from hub.bundle.preprocessing import PreparedSession
+from hub.calibration.resection_scan import (
+    LIKELY_CANDIDATES,
+    MIN_INLIERS,
+    MIN_POINTS,
+    TRUNCATION_PX,
+    SeenLabel,
+    along_path,
+    common_rows,
+    moment_scan,
+    path_moments,
+    resect,
+    resected_residuals,
+    seen_labels,
+    verify,
+)
+from hub.calibration.solution import Solution
+from protocols.geometry.types import Floats
+from protocols.session.observations import Observations
+
+_STARTS, _ITERATIONS = (0.25, 0.5, 0.75), 5
+"""Shares of the rows at which the division begins; then it goes where the two poses say, until it stays."""
+_LEAST_GAIN = 2.0
+"""Cost of one pose over that of two: 1.01 to 1.05 of cameras that stand still (simulated, also with lenses 20 % off,
+clocks that step, wander or drift), 1.05 to 1.33 of two recorded rigs; 2.4 of one turned by half a degree, 20 by one."""
+_LEAST_S = 1.0  # on each side of a move: half a second of a path gave a pose that was 22° off
+_LEAST_ROWS, _MOST_ROWS = 30, 400
+"""Rows of a camera on each side of a move, as many as a camera of a network needs; of all, no more are used."""
+_MARGIN_S = 0.3
+"""Around a move, left out too: nobody moves a camera in an instant, and the rows were smoothed across it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A move of a camera at ``time`` [s] on its clock, by an angle of ``turned`` [rad]. keeps_later: its later rows are
+    used; rows: how many are left out."""
+
+    time: float
+    turned: float
+    keeps_later: bool
+    rows: int
+
+    def told(self, name: str) -> str:
+        """One sentence for a person."""
+        return (
+            f"{name}: it was moved (turned by about {np.degrees(self.turned):.2g}°) at its time {self.time:.1f} s: its "
+            f"{self.rows} rows {'before' if self.keeps_later else 'after'} that were left out"
+        )
+
+
+def moved_cameras(solution: Solution, observations: Observations) -> dict[str, Move]:
+    """The refused cameras that were moved, and of the others the one that most probably was."""
+    reconstruction, prepared = solution.reconstruction, solution.prepared
+    divisions: dict[str, tuple[float, float, float]] = {}
+    for name in [name for name in prepared.cameras if name not in reconstruction.names]:
+        labels = seen_labels(prepared.cameras[name], reconstruction)
+        maps = _likely_maps(labels, prepared.cameras[name]) if labels and len(reconstruction.names) > 1 else []
+        found = max((one for at in maps if (one := _divide(labels, prepared.cameras[name], *at))), default=None)
+        divisions |= {} if found is None else {name: found}
+    placed = moved_camera(prepared, reconstruction)
+    divisions |= {} if placed is None else {placed[0]: placed[1]}
+    out = {}
+    for name, (_, at, turned) in divisions.items():
+        time = at / prepared.time_scale(name) + prepared.time_origins[name]
+        rows = np.concatenate([track.time for track in observations.of_camera(name)])
+        before, after = int((rows < time).sum()), int((rows > time).sum())
+        out[name] = Move(time, turned, after > before, min(before, after))
+    return out
+
+
+def moved_camera(
+    prepared: PreparedSession, reconstruction: Reconstruction
+) -> tuple[str, tuple[float, float, float]] | None:
+    """Of the placed cameras the one that most probably was moved, which distorts the path for all: its name, gain, time
+    [s] since its origin and angle [rad]. None where none was, or where fewer than two others are placed."""
+    found: dict[str, tuple[float, float, float]] = {}
+    for name, clock in zip(reconstruction.names, reconstruction.state.cameras, strict=True):
+        labels = seen_labels(prepared.cameras[name], reconstruction)
+        if labels and len(reconstruction.names) > 2:
+            offset = clock.offset - clock.rate * clock.centre
+            divided = _divide(labels, prepared.cameras[name], clock.rate, offset)
+            found |= {} if divided is None else {name: divided}
+    return max(found.items(), key=lambda one: one[1], default=None)
+
+
+def without_moved(observations: Observations, moves: Mapping[str, Move]) -> Observations:
+    """The observations without the rows on the shorter side of each move."""
+    tracks = {}
+    for key, track in observations.tracks.items():
+        move = moves.get(key[0])
+        if move is not None:
+            after = track.time - move.time
+            track = track.select(after > _MARGIN_S if move.keeps_later else after < -_MARGIN_S)
+        if len(track):
+            tracks[key] = track
+    return replace(observations, tracks=tracks)
+
+
+def _likely_maps(labels: list[SeenLabel], camera: CameraInput) -> list[tuple[float, float]]:
+    """Rates and offsets at which one half of a camera's rows has a pose: a move leaves one half untouched."""
+    moments, maps = path_moments(labels), []
+    for later in (False, True):
+        samples = []
+        for one in labels:
+            time, points = along_path(one.track)
+            half = (time >= float(np.median(one.track.time))) == later
+            samples.append((one, time[half], points[half]))
+        scan = sorted(moment_scan(labels, moments, 1.0, later), key=lambda one: one.score)
+        placed = [verify(one, samples, camera) for one in scan[: LIKELY_CANDIDATES // 2]]
+        maps += [(one.rate, one.offset) for one in placed if one.inliers >= MIN_INLIERS]
+    return maps
+
+
+def _divide(
+    labels: list[SeenLabel], camera: CameraInput, rate: float, offset: float
+) -> tuple[float, float, float] | None:
+    """By how much the cost of one pose is more than that of two, the time [s] that divides their rows, and the angle
+    between them; None if one pose does."""
+    samples = [(one, one.track.time, one.track.points) for one in labels]
+    world, image, internal = common_rows(samples, rate, offset)
+    order = np.argsort(internal, kind="stable")[:: max(1, len(internal) // _MOST_ROWS)]
+    world, image, times = world[order], image[order], (internal[order] - offset) / rate
+    count, focal = len(times), camera.intrinsics.focal
+    least = max(MIN_POINTS, _LEAST_ROWS * count // len(internal))
+    if count < 2 * least:
+        return None
+
+    def costs(part: slice) -> Floats:
+        residual = resected_residuals(world[part], image[part], world, image, focal)
+        return np.asarray(np.minimum(residual, TRUNCATION_PX) ** 2)
+
+    best = float("inf"), least
+    for start in _STARTS:
+        at = int(start * count)
+        for _ in range(_ITERATIONS):
+            first, second = costs(slice(at)), costs(slice(at, None))
+            total = np.cumsum(first - second) + second.sum()  # where the first ends behind each row
+            new = least + int(np.argmin(total[least - 1 : count - least]))
+            best = min(best, (float(total[new - 1]) / count, new))
+            if new == at:
+                break
+            at = new
+    cost, at = best
+    if min(times[at - 1] - times[0], times[-1] - times[at]) < _LEAST_S:
+        return None
+    poses = resect(world[:at], image[:at]), resect(world[at:], image[at:])
+    explained = [float((costs(part)[part] < TRUNCATION_PX**2).mean()) for part in (slice(at), slice(at, None))]
+    gain = float(costs(slice(None)).mean()) / max(cost, 1e-9)
+    if min(explained) < MIN_INLIERS or gain < _LEAST_GAIN or poses[0] is None or poses[1] is None:
+        return None
+    cosine = 0.5 * (np.trace(poses[0][0] @ poses[1][0].T) - 1.0)
+    return gain, float(0.5 * (times[at - 1] + times[at])), float(np.arccos(np.clip(cosine, -1.0, 1.0)))
