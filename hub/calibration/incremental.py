@@ -26,11 +26,11 @@ from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, ClockStep, FreeParameters
 from hub.calibration.acceptance import least_certain_camera, misfits
 from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, final_adjustment
-from hub.calibration.moved_cameras import moved_camera
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
 from hub.calibration.pipeline import calibrate
-from hub.calibration.resection_scan import scan_resection
+from hub.calibration.resection.moved_cameras import moved_camera
+from hub.calibration.resection.scan import scan_resection
 from hub.calibration.result import assemble_calibration
 from hub.calibration.self_calibration import focal_prior, with_cameras, with_lens
 from hub.calibration.solution import Solution

@@ -26,7 +26,6 @@ from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
 from hub.calibration.acceptance import LAG_CONFLICT, CameraTests, misfits, network_failure
 from hub.calibration.final_adjustment import final_adjustment
-from hub.calibration.moved_cameras import moved_cameras, without_moved
 from hub.calibration.pairs.pair_network import (
     Progress,
     coincide,
@@ -35,10 +34,11 @@ from hub.calibration.pairs.pair_network import (
     frame_rate_warnings,
     solve_pairs,
 )
+from hub.calibration.resection.moved_cameras import moved_cameras, without_moved
+from hub.calibration.resection.unconnected import connect_by_resection, listed
 from hub.calibration.result import assemble_calibration, isolated_pair_report
 from hub.calibration.self_calibration import LEAST_CAMERAS, initial_self_calibration, with_updated_lenses
 from hub.calibration.solution import Solution
-from hub.calibration.unconnected import connect_by_resection, listed
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate, connected_components, synchronise_clocks
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.sync.hypothesis import PairSolution

@@ -16,7 +16,7 @@ from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
 from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
-from hub.calibration.unconnected import listed
+from hub.calibration.resection.unconnected import listed
 from hub.clocks.observation_stream import LEAST_ROWS, ObservationStream
 from hub.distributed.network.host import NodeHost
 from hub.distributed.solver import node_calibration

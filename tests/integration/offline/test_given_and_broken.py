@@ -12,12 +12,13 @@ import pytest
 from hub.bundle import model_comparison
 from hub.bundle.preprocessing import prepare
 from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations
-from hub.calibration import resection_scan, result
+from hub.calibration import result
 from hub.calibration.incremental import update_calibration
 from hub.calibration.pairs import pair_network
 from hub.calibration.pairs.pair_network import solve_pairs
 from hub.calibration.pipeline import calibrate, solve_network
-from hub.calibration.resection_scan import find_time_map
+from hub.calibration.resection import scan as resection_scan
+from hub.calibration.resection.scan import find_time_map
 from hub.calibration.triangulation import triangulate
 from hub.sync import pair_solver
 from hub.sync.pair_solver import _PairSearch
@@ -203,9 +204,9 @@ def test_candidates_at_other_frame_rates_do_not_displace_those_at_the_nominal_on
     good = broken_cameras.without(session, "cam3")
     prepared, pairs = solve_pairs(prepare(good.rig, good.observations()), lambda text, share: None)
     path = solve_network(prepared, pairs, lambda text, share: None).reconstruction
-    scan = resection_scan._moment_scan
+    scan = resection_scan.moment_scan
     crowd = [resection_scan.TimeMapCandidate(2.0, float(lag), 0.0, 10.0) for lag in range(20)]
-    monkeypatch.setattr(resection_scan, "_moment_scan", lambda *of: scan(*of) if of[2] == 1.0 else crowd)
+    monkeypatch.setattr(resection_scan, "moment_scan", lambda *of: scan(*of) if of[2] == 1.0 else crowd)
     camera = prepare(session.rig, session.observations()).cameras["cam3"]
     assert find_time_map(camera, path, (1.0, 2.0))[0] == find_time_map(camera, path, (1.0,))[0]
 
@@ -215,7 +216,7 @@ def test_a_false_detection_that_stays_in_one_place_does_not_displace_a_resected_
     points = rng.uniform(-1.0, 1.0, (80, 3)) + [0.0, 0.0, 4.0]
     seen = points[:, :2] / points[:, 2:]
     seen[:12] = [0.4, -0.3]
-    residual = resection_scan._resected_residuals(points, seen, points, seen, 500.0)
+    residual = resection_scan.resected_residuals(points, seen, points, seen, 500.0)
     assert np.median(residual[12:]) < 1.0
 
 

@@ -1,6 +1,6 @@
 """Cameras that no pair connects to the others: found by resection against the path that the others have solved.
 
-One scan over lags and clock rates per camera (`resection_scan.find_time_map`) takes the place of searches of it
+One scan over lags and clock rates per camera (`scan.find_time_map`) takes the place of searches of it
 against every other one. It also finds a camera that recorded at another time than the pair from which the
 reconstruction began, and times made with a wrong frame rate.
 """
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from hub.bundle.initialisation import Reconstruction, place_cameras
 from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import FreeParameters
-from hub.calibration.resection_scan import find_time_map
+from hub.calibration.resection.scan import find_time_map
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from hub.sync.hypothesis import PairSolution
 from hub.sync.pair_solver import FRAME_RATE_RATIOS

@@ -13,7 +13,7 @@ import numpy as np
 
 from hub.bundle.initialisation import CameraInput, Reconstruction
 from hub.bundle.preprocessing import PreparedSession
-from hub.calibration.resection_scan import (
+from hub.calibration.resection.scan import (
     LIKELY_CANDIDATES,
     MIN_INLIERS,
     MIN_POINTS,
