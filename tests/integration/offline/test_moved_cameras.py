@@ -27,7 +27,7 @@ def turned(session: Session, name: str, since: float, angle: float) -> Session:
     return replace(session, pixels=pixels)
 
 
-@pytest.mark.parametrize(("cameras", "since", "angle"), [(4, 8.0, 0.015), (5, 20.0, 0.1), (3, 21.0, 0.3)])
+@pytest.mark.parametrize(("cameras", "since", "angle"), [(4, 8.0, 0.03), (5, 20.0, 0.1), (3, 21.0, 0.3)])
 def test_a_turned_camera_is_named_and_its_longer_side_is_used(cameras: int, since: float, angle: float) -> None:
     session = simulate(5, cameras, 30)
     found = calibrate(*_given(turned(session, "cam2", since, angle)), thorough=True)
