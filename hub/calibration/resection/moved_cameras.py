@@ -149,6 +149,9 @@ def _divide(
         residual = resected_residuals(world[part], image[part], world, image, focal)
         return np.asarray(np.minimum(residual, TRUNCATION_PX) ** 2)
 
+    together = float(costs(slice(None)).mean())
+    if together < _LEAST_PX**2:
+        return None  # whatever two poses explain
     best = float("inf"), least
     for start in _STARTS:
         at = int(start * count)
@@ -165,7 +168,6 @@ def _divide(
         return None
     poses = resect(world[:at], image[:at]), resect(world[at:], image[at:])
     explained = [float((costs(part)[part] < TRUNCATION_PX**2).mean()) for part in (slice(at), slice(at, None))]
-    together = float(costs(slice(None)).mean())
     gain = together / max(cost, 1e-9)
     moved = gain >= MIN_CANDIDATE_RATIO and together - cost >= _LEAST_PX**2
     if not moved or min(explained) < MIN_INLIERS or poses[0] is None or poses[1] is None:
