@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -134,9 +135,9 @@ def calibrate(
             solution = solve_with_unknown_lenses(
                 rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
             )
-        if thorough and solver == "joint" and known is None and not prepared.shared_clock:
-            moves = moved_cameras(solution, observations)
-            if moves:
+        may_move = thorough and solver == "joint" and known is None and not prepared.shared_clock
+        if may_move and (moves := moved_cameras(solution, observations)):
+            with suppress(Refused):  # what is left says too little: then all rows have to do
                 found = calibrate(
                     rig, without_moved(observations, moves), progress,
                     thorough=True, clock_priors=clock_priors, refine_lenses=refine_lenses,
