@@ -142,8 +142,8 @@ def calibrate(
                     rig, without_moved(observations, moves), progress,
                     thorough=True, clock_priors=clock_priors, refine_lenses=refine_lenses,
                 )  # fmt: skip
-                told = tuple(move.told(name) for name, move in moves.items())
-                return replace(found, warnings=(*found.warnings, *told))
+                warnings = tuple(move.warning(name) for name, move in moves.items())
+                return replace(found, warnings=(*found.warnings, *warnings))
         report("covariances", 0.95)
         return assemble_calibration(rig, solution, refine_lenses=refine_lenses)
     except Refused as refusal:

@@ -56,7 +56,7 @@ class Move:
     keeps_later: bool
     rows: int
 
-    def told(self, name: str) -> str:
+    def warning(self, name: str) -> str:
         """One sentence for a person."""
         return (
             f"{name}: it was moved (turned by about {np.degrees(self.turned):.2g}°) at its time {self.time:.1f} s: its "

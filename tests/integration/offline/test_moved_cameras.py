@@ -31,13 +31,13 @@ def turned(session: Session, name: str, since: float, angle: float) -> Session:
 def test_a_turned_camera_is_named_and_its_longer_side_is_used(cameras: int, since: float, angle: float) -> None:
     session = simulate(5, cameras, 30)
     found = calibrate(*_given(turned(session, "cam2", since, angle)), thorough=True)
-    (told,) = [text for text in found.warnings if "it was moved" in text]
-    assert told.startswith("cam2: ")
-    assert ("rows before that" in told) == (since < 15.0)
-    assert 0.5 < float(told.split("turned by about ")[1].split("°")[0]) / np.degrees(angle) < 2.0
+    (warning,) = [text for text in found.warnings if "it was moved" in text]
+    assert warning.startswith("cam2: ")
+    assert ("rows before that" in warning) == (since < 15.0)
+    assert 0.5 < float(warning.split("turned by about ")[1].split("°")[0]) / np.degrees(angle) < 2.0
     clock = session.clocks["cam2"]
     shown = (since - clock.time_offset) / clock.clock_rate
-    assert float(told.split("at its time ")[1].split(" s")[0]) == pytest.approx(shown, abs=0.5)
+    assert float(warning.split("at its time ")[1].split(" s")[0]) == pytest.approx(shown, abs=0.5)
     still = calibrate(*_given(session), thorough=True)
     for name in still.cameras.keys() - {"cam2"}:
         off = found.cameras[name].pose.position - still.cameras[name].pose.position
