@@ -13,6 +13,7 @@ from hub.report.quality_assessment import (
     QualityAssessment,
     assess_quality,
     assess_refusal,
+    capital,
     half_interval_ms,
 )
 from hub.report.style import STYLE
@@ -230,7 +231,7 @@ def _assessment_section(assessment: QualityAssessment, keys: str) -> str:
     heading = "Why" if assessment.level == "refused" else "Problems" if listed("attention") else "Notes"
     if not_good:
         columns.append(f'<div><h3>{heading}</h3><ul class="findings">{not_good}</ul></div>')
-    todo = "".join(f"<li>{tables.code(_capital(text))}</li>" for text in assessment.actions)
+    todo = "".join(f"<li>{tables.code(capital(text))}</li>" for text in assessment.actions)
     todo = f'<h3>What to do</h3><ol class="todo">{todo}</ol>' if todo else "<h3>What to do</h3><p>Nothing.</p>"
     if assessment.level == "refused":
         columns.append(f"<div>{todo}</div>")
@@ -282,11 +283,6 @@ def section(title: str, lead: str, content: str) -> str:
         return ""
     lead = f'<p class="lead">{esc(lead)}</p>' if lead else ""
     return f"<section><h2>{esc(title)}</h2>{lead}{content}</section>"
-
-
-def _capital(text: str) -> str:
-    # A leading camera name is not capitalised.
-    return text if ":" in text.split(" ")[0] else text[:1].upper() + text[1:]
 
 
 def html_page(title: str, headline: str, parts: list[str], script: str = "") -> str:

@@ -121,8 +121,13 @@ def is_contradicting(outcome: Calibration | Refused, pair: PairReport) -> bool:
     return any("contradicts" in text and any(name in text for name in names) for text in outcome.warnings)
 
 
+def capital(text: str) -> str:
+    """The text with a capital first letter, unless it begins with the name of a camera."""
+    return text if ":" in text.split(" ")[0] else text[:1].upper() + text[1:]
+
+
 def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:].rstrip(".") + ("" if text.endswith("?") else ".")
+    return capital(text).rstrip(".") + ("" if text.endswith("?") else ".")
 
 
 def _listed(names: list[str]) -> str:
@@ -237,8 +242,8 @@ def _pixels(calibration: Calibration, used: dict[str, RowUsage]) -> list[Quality
                 QualityFinding(
                     "attention" if rows.share < _VERY_FEW_ROWS else "note",
                     f"{name}: only {100 * rows.share:.0f} % of its rows fit one trajectory; "
-                    "the rest are false detections or other points.",
-                    f"{name}: train or mask the detector so that it detects only this point.",
+                    "the rest are false detections, other points, or from before or after it was moved.",
+                    f"{name}: unless it was moved, train or mask the detector so that it detects only this point.",
                 )
             )
     if fine:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hub.report.measures import RowUsage
 from hub.report.pair_graph import edge_kind
-from hub.report.quality_assessment import half_interval_ms
+from hub.report.quality_assessment import capital, half_interval_ms
 from hub.report.remedies import remedy_for
 from hub.report.svg import THIN, esc, number, short, whole
 from protocols.core.errors import Refused
@@ -165,7 +165,7 @@ def acceptance(outcome: Calibration | Refused) -> str:
 def refused(reasons: dict[str, str], counts: dict[str, int]) -> str:
     """One row per refused camera: number of rows, reason, what to do."""
     rows = [
-        [f"<b>{esc(name)}</b>", whole(counts.get(name, 0)), esc(reason), code(_capital(remedy_for(reason)))]
+        [f"<b>{esc(name)}</b>", whole(counts.get(name, 0)), esc(reason), code(capital(remedy_for(reason)))]
         for name, reason in reasons.items()
     ]
     return table(["Camera", "Rows", "Why", "What to do"], rows, kind="refused")
@@ -175,10 +175,6 @@ def code(text: str) -> str:
     """Escaped text with the parts between backticks set as code."""
     parts = esc(text).split("`")
     return "".join(f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts))
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def provenance(facts: dict[str, str], rig: Rig, command: str) -> str:

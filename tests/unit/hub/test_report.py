@@ -11,7 +11,7 @@ import pytest
 
 from hub.report import build_report, measures
 from hub.report.convergence import adjustment_history
-from hub.report.quality_assessment import assess_quality, assess_refusal
+from hub.report.quality_assessment import assess_quality, assess_refusal, capital
 from hub.report.remedies import remedy_for
 from hub.report.svg import number, short, ticks
 from protocols.core.errors import Refused
@@ -44,6 +44,11 @@ def test_the_quality_assessment_comes_first_and_names_the_problems() -> None:
     assessment = page[first : page.index("</section>")]
     assert "cam3 was refused" in assessment
     assert "distances = [[&quot;cam0&quot;, &quot;cam1&quot;, 3.42]]" in assessment
+
+
+@pytest.mark.parametrize(("given", "shown"), [("cam0: it was moved", "cam0: it was moved"), ("no pair", "No pair")])
+def test_names_of_cameras_are_not_capitalised(given: str, shown: str) -> None:
+    assert capital(given) == shown
 
 
 def test_the_report_contains_every_camera_pair_and_reason() -> None:
