@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.bundle.datum.control_outliers import reject_outliers
+from hub.bundle.datum.control_outliers import reject_outliers, reject_refuted
 from hub.bundle.datum.gauge import fix_gauge
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
@@ -97,3 +97,18 @@ def test_a_wrong_distance_among_correct_ones_is_rejected() -> None:
     assert [d[:2] for d in left.distances] == [end for end in ends if end != ("cam1", "cam2")]
     assert "cam1–cam2" in reported[0]
     del rig
+
+
+def test_a_reference_that_is_six_stds_off_is_doubted_or_rejected_and_correct_surveys_are_not() -> None:
+    named, rejected, false = 0, 0, 0
+    network = np.diag(np.tile([1e-6, 1e-6, 1e-6, 1e-8, 1e-8, 1e-8], 8))
+    for seed in range(100):
+        for wrong in ({}, {2: so3.exp(np.full(3, seed)) @ [0.12, 0.0, 0.0]}):
+            rig, names, _, poses = surveyed(seed, 8, wrong, 0.02, std=0.02)
+            left, warnings = reject_refuted(rig, names, poses, network)
+            if not wrong:
+                false += len(warnings)
+            elif any("cam2" in text for text in warnings):
+                named += 1
+                rejected += left.cameras["cam2"].position is None
+    assert (named >= 85, rejected < named, false <= 5) == (True, True, True), (named, rejected, false)
