@@ -32,7 +32,7 @@ from hub.calibration.pipeline import calibrate
 from hub.calibration.resection.moved_cameras import moved_camera
 from hub.calibration.resection.scan import scan_resection
 from hub.calibration.result import assemble_calibration
-from hub.calibration.self_calibration import focal_prior, with_cameras, with_lens
+from hub.calibration.self_calibration import focal_prior, initial_self_calibration, with_cameras, with_lens
 from hub.calibration.solution import Solution
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from hub.clocks.external_prior import ExternalClockPrior
@@ -103,7 +103,6 @@ def update_calibration(
         # A step explains a part of a move, while of what a step leaves two poses explain nothing.
         observations, last, (prepared, reconstruction), steps = _with_clock_steps(*given, further=False)
         move = moved_camera(prepared, reconstruction)
-    refused = dict(prepared.refused)
     origins = prepared.time_origins
     moved = {} if move is None else {move[0]: move[1][1] / prepared.time_scale(move[0]) + origins[move[0]]}
     if moved:
@@ -118,7 +117,7 @@ def update_calibration(
         raise Refused("fewer than two cameras stand where they stood", dict.fromkeys(moved, "was moved"))
     pairs: list[PairSolution] = []
     reasons: dict[str, str] = {}
-    new = [name for name in prepared.cameras if name not in placed and name not in moved]
+    new = [name for name in (*prepared.cameras, *prepared.uncalibrated) if name not in placed and name not in moved]
     clocks = {name: _clock_of(state) for name, state in placed.items()}
     for name in moved:
         if name in prepared.cameras:  # its times count from another row now
@@ -127,7 +126,7 @@ def update_calibration(
             clocks[name] = replace(clock, centre=clock.centre - later)
     if new and search:
         reconstruction = _warm_start(prepared, placed) if moved else reconstruction
-        for name in new:
+        for name in (one for one in new if one in prepared.cameras):
             reasons[name] = "no common clock bounds its lag yet"
             expected = _expected_clock(prepared, name, reconstruction, {**(arrivals or {}), **(clock_priors or {})})
             if expected is not None:
@@ -136,9 +135,12 @@ def update_calibration(
         unknown = [name for name in new if name not in clocks]
         if full and unknown:
             prepared, pairs = solve_new_pairs(prepared, unknown, list(placed), clock_priors)
-            clocks |= _clocks_from_pairs(pairs, placed, prepared)
+            prepared, pairs = initial_self_calibration(rig, prepared, pairs)
+            found_clocks = _clocks_from_pairs(pairs, placed, prepared)
+            clocks |= {name: clock for name, clock in found_clocks.items() if name in prepared.cameras}
             reasons |= {name: describe_failures(name, pairs) for name in unknown if name not in clocks}
-    reasons = {name: reasons.get(name, "waits for the next search of its lag") for name in new if name not in clocks}
+    refused, waits = dict(prepared.refused), "waits for the next search of its lag"
+    reasons = {name: reasons.get(name) or refused.get(name, waits) for name in new if name not in clocks}
     if len(clocks) > len(placed) or moved:
         reconstruction, unplaced = place_cameras(
             prepared.cameras,

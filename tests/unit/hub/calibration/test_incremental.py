@@ -90,6 +90,26 @@ def test_a_late_camera_joins_by_resection_within_its_arrival_bound() -> None:
     assert abs(float(camera.time_map.reference_from_camera(CameraTime(camera.lag_time))) - truth) < 2e-3
 
 
+def test_a_late_camera_without_a_lens_joins_and_has_it_estimated() -> None:
+    session = simulate(11, 4, 45)
+    true = session.rig.cameras["cam3"]
+    assert true.intrinsics is not None
+    rig = replace(session.rig, cameras=session.rig.cameras | {"cam3": replace(true, intrinsics=None)})
+    first = update_calibration(rig, without(until(session, 25.0), "cam3"), None).calibration
+    rows = until(session, 45.0, cam3=10.0)
+    waiting = update_calibration(rig, rows, first, full=False, arrivals=priors(session)).calibration
+    assert "no intrinsics" in waiting.refused["cam3"]
+    joined = update_calibration(rig, rows, waiting, full=True, arrivals=priors(session)).calibration
+    again = update_calibration(rig, rows, joined, full=False, search=False).calibration
+    for found in (joined, again):
+        assert not found.refused
+        camera = found.cameras["cam3"]
+        error = np.log(camera.intrinsics.focal / true.intrinsics.focal)
+        assert abs(error) < max(4.0 * camera.focal_std, 0.004)
+        truth = session.shown(found.reference, session.true_time("cam3", camera.lag_time))
+        assert abs(float(camera.time_map.reference_from_camera(CameraTime(camera.lag_time))) - truth) < 2e-3
+
+
 @pytest.mark.parametrize("error", [-3.0, 0.7, 5.0])
 def test_a_wrong_arrival_gives_no_wrong_lag(error: float) -> None:
     session = simulate(11, 4, 40)
