@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hub.bundle.noise.clock_wander import Wander
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SplineBasis
 from protocols.geometry.camera import Intrinsics
@@ -155,7 +156,7 @@ class AdjustmentState:
     sigma: (cameras,) noise of one pixel coordinate. steps: convergence history. jitter: (cameras,) std [s] of the
     cameras' timestamps where frame times were estimated (`timestamp_jitter`); None = not estimated, or no jitter found.
     correlated_noise: noise model of the re-fit by generalised least squares (`gls`); None = independent rows.
-    clock_steps: for which the rows' times are corrected.
+    clock_steps, wanders: for which the rows' times are corrected.
     """
 
     cameras: tuple[CameraState, ...]
@@ -165,6 +166,7 @@ class AdjustmentState:
     jitter: Floats | None = None
     correlated_noise: CorrelatedNoise | None = None
     clock_steps: tuple[ClockStep, ...] = ()
+    wanders: tuple[Wander, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

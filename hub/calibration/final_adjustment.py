@@ -127,7 +127,7 @@ def final_adjustment(
     problem, state = reconstruction.problem, reconstruction.state
     if warm and online and state.jitter is None:
         # Near the solution the re-fit alone converges; where it does not apply, the adjustment does.
-        problem, state = estimate_frame_times(problem, state)
+        problem, state = estimate_frame_times(problem, state, newest=True)
         problem = model_comparison.with_crystal_rates(problem, state)
         refitted = _refit_online(problem, state, refine_lenses)
         if refitted[1] is not state:
@@ -144,7 +144,7 @@ def final_adjustment(
         problem, state = (problem, state) if online else _steps_or_rates(even, (problem, state))
     if not online and problem.free_parameters.clock:
         problem, state = _with_readouts(problem, state, report)
-    problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8))
+    problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8), newest=online)
     problem = model_comparison.with_crystal_rates(problem, state)
     if refine_lenses and not warm:
         report("adjusting the lenses", 0.85)

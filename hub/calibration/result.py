@@ -118,9 +118,11 @@ def assemble_calibration(
     maps[reference] = TimeMap(1.0, 0.0)
     middles = cov.middles_of_overlap(problem, state)
     lag_times = [float(camera.camera_time(middles[i, [reference]])[0]) for i, camera in enumerate(state.cameras)]
+    for one in state.wanders:
+        lag_times[one.camera] = one.instant
     # Of the maps onto the reference camera's clock, in the middle of their common span.
     lag_stds = [
-        _with_step_errors(std / base.rate, problem, state, i, reference)
+        _with_correction_errors(std / base.rate, problem, state, i, reference)
         if problem.free_parameters.clock and i != reference
         else 0.0
         for i, std in enumerate(cov.relative_clock_stds(covariance, problem, state)[reference].tolist())
@@ -142,7 +144,12 @@ def assemble_calibration(
             readout_std=float(readout_stds[i]) / time_scales[i],
             lag_time=float(lag_times[i]) / time_scales[i] + time_origins[i],
             lag_std=lag_stds[i] / time_scales[reference],
-            clock_rate_std=cov.clock_rate_std(covariance, state, i, reference)
+            clock_rate_std=float(
+                np.hypot(
+                    cov.clock_rate_std(covariance, state, i, reference),
+                    np.linalg.norm([one.rate_std for one in state.wanders if one.camera in (i, reference)]),
+                )
+            )
             if problem.free_parameters.clock
             else 0.0,
             sensitivities=effects[i],
@@ -179,6 +186,7 @@ def assemble_calibration(
         + _rejected_rows(names, problem, state)
         + _estimated_readouts(cameras)
         + _estimated_jitter(names, state, time_scales)
+        + _wandering_clocks(names, state, time_scales)
         + _clock_step_warnings(cameras)
         + _wrong_detector_stds(cameras)
         + _large_residuals(names, state),
@@ -237,6 +245,7 @@ def _reordered(problem: Problem, state: AdjustmentState, order: list[int]) -> tu
         sigma=state.sigma[order],
         jitter=None if state.jitter is None else state.jitter[order],
         clock_steps=tuple(replace(step, camera=new_index[step.camera]) for step in state.clock_steps),
+        wanders=tuple(replace(one, camera=new_index[one.camera]) for one in state.wanders),
         correlated_noise=None if state.correlated_noise is None else state.correlated_noise.select(order),
     )
 
@@ -337,6 +346,16 @@ def _estimated_jitter(names: list[str], state: AdjustmentState, time_scales: lis
     )
 
 
+def _wandering_clocks(names: list[str], state: AdjustmentState, time_scales: list[float]) -> tuple[str, ...]:
+    """One sentence for each clock that wanders."""
+    return tuple(
+        f"{names[one.camera]}: its clock's rate changes: beside an even clock it is off by up to "
+        f"{1e3 * float(np.abs(one.values).max()) / time_scales[one.camera]:.2g} ms: each frame's time was corrected, "
+        "and its time map holds at lag_time_s"
+        for one in state.wanders
+    )
+
+
 def _clock_step_warnings(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
     """One sentence for each clock step."""
     return tuple(
@@ -381,11 +400,13 @@ def _time_map_std(
 ) -> float:
     if not problem.free_parameters.clock or camera == reference:
         return 0.0
-    return _with_step_errors(cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference)
+    return _with_correction_errors(
+        cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference
+    )
 
 
-def _with_step_errors(std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int) -> float:
-    variance = std**2
+def _with_correction_errors(std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int) -> float:
+    variance = std**2 + sum(one.std**2 for one in state.wanders if one.camera in (camera, reference))
     for step in state.clock_steps:
         if step.camera in (camera, reference):  # its size moves the map by the share of the rows beyond it
             rows = [rows.time[rows.use] for rows in problem.rows if rows.camera == step.camera]

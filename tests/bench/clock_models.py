@@ -1,12 +1,13 @@
-"""What is made of a camera's clock: even, with a step, with a rolling shutter's readout, with jitter of its stamps.
+"""What is made of a camera's clock: even, with a step, a rolling shutter's readout, jitter of its stamps, or slewed.
 
     python -m tests.bench.clock_models [--sessions 4] [--first 7000] [--only step30,readouts+jitter] [--verbose]
         [--seconds 40] [--noise 0.5] [--fps 30,25,29.97,50] [--fastest 0.7] [--focal-error 0] [--labels 1]
 
 Four cameras round one path, calibrated once with each effect put into a random camera, or into all (plural): a step in
-ms, half a frame interval of readout, jitter in ms (std). Found: reported of that camera (a step within 5 s, its size to
-a half). Wrong: any other; of a readout, more than 3 stds from its truth. z: errors over their stds. --focal-error:
-relative error (std) of given focal lengths. --fastest: largest frequency of the motion [Hz].
+ms, half a frame interval of readout, jitter in ms (std), a rate that is ppm more for a quarter of the time. Found:
+reported of that camera (a step within 5 s, its size to a half). Wrong: any other; of a readout, more than 3 stds from
+its truth. z: errors over their stds; beside slews, of all lags where no clock steps or jitters. --focal-error: relative
+error (std) of given focal lengths. --fastest: largest frequency of the motion [Hz].
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402
 
 from hub.calibration.pipeline import calibrate  # noqa: E402
+from protocols.core.clocks import CameraTime, TimeMap  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402
 from protocols.session.calibration import Calibration  # noqa: E402
@@ -35,9 +37,9 @@ from tests.support import rigs  # noqa: E402
 CAMERAS = 4
 EFFECTS = (
     "none,step15,step30,step60,readout,readouts,jitter5,jitter20,jitters5,step30+readouts,step30+jitter10,"
-    "step30+jitters10,readout+jitter5,readouts+jitters10"
+    "step30+jitters10,readout+jitter5,readouts+jitters10,slew150,slew500"
 )
-_PART = re.compile(r"(step|readout|jitter)(s?)(\d*)")
+_PART = re.compile(r"(step|readout|jitter|slew)(s?)(\d*)")
 _NEAR_S, _NEAR_SHARE, _WRONG_Z = 5.0, 0.5, 3.0
 
 
@@ -55,12 +57,20 @@ class World:
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A camera's effects, put in or reported: steps as (camera time, size, std), readout with std, jitter [s]."""
+    """A camera's effects, put in or reported: steps as (camera time, size, std), readout with std, jitter [s], changes
+    of its rate as (camera time, size). even: its clock without them. lag_z: error of its lag in stds."""
 
     steps: tuple[tuple[float, float, float], ...] = ()
     readout: float = 0.0
     readout_std: float = 0.0
     jitter: float = 0.0
+    slews: tuple[tuple[float, float], ...] = ()
+    even: TimeMap | None = None
+    lag_z: float = 0.0
+
+    def slewed(self, time: Floats) -> Floats:
+        """What the changes of its rate add to camera times (n,)."""
+        return np.asarray(sum((rate * np.maximum(time - at, 0.0) for at, rate in self.slews), np.zeros_like(time)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +99,18 @@ def session(seed: int, effect: str, world: World) -> tuple[Rig, Observations, di
             ((float(begin + share * (end - begin)), 1e-3 * sign * parts["step"], 0.0),) if "step" in parts else (),
             0.5 / camera.fps if "readout" in parts else 0.0,
             jitter=1e-3 * parts.get("jitter", 0.0),
+            slews=tuple(
+                (float(begin + part * (end - begin)), 1e-6 * rate)
+                for part, rate in ((0.8 * share, parts["slew"]), (0.8 * share + 0.25, -parts["slew"]))
+            )
+            if "slew" in parts
+            else (),
+            even=one.clocks[name],
         )
         clocks[name] = clock
         errors = rng.normal(0.0, clock.jitter, max(int(track.frame.max()) for track in own) + 1)
         for track in own:
-            stamps = track.time + errors[track.frame]
+            stamps = track.time + errors[track.frame] + clock.slewed(track.time)
             for at, size, _ in clock.steps:
                 stamps = stamps + np.where(track.time >= at, size, 0.0)
             pixels = _pixels(one, name, track.label, track.time, clock.readout)
@@ -118,14 +135,28 @@ def _pixels(one: rigs.Session, name: str, label: str, shown: Floats, readout: fl
     return np.asarray(pixels)
 
 
-def reported(found: Calibration, name: str) -> Clock | None:
+def reported(found: Calibration, name: str, true: dict[str, Clock]) -> Clock | None:
     """What a calibration says of a camera's clock."""
     if name not in found.cameras:
         return None
+    mine, base = true[name], true[found.reference]
+    assert mine.even is not None
+    assert base.even is not None
+    shown = CameraTime(found.cameras[name].lag_time - float(mine.slewed(np.array([found.cameras[name].lag_time]))[0]))
+    even = float(base.even.camera_from_reference(mine.even.reference_from_camera(shown)))
+    error = float(found.cameras[name].time_map.reference_from_camera(CameraTime(found.cameras[name].lag_time))) - (
+        even + float(base.slewed(np.array([even]))[0])
+    )
     jitter = [re.match(name + r": its stamps jitter by ([\d.e-]+) ms", text) for text in found.warnings]
     one = found.cameras[name]
     stds = [1e-3 * float(match[1]) for match in jitter if match]
-    return Clock(one.clock_steps, one.readout, one.readout_std, max(stds, default=0.0))
+    slews = (
+        ((0.0, 0.0),) if any(text.startswith(f"{name}: its clock's rate changes") for text in found.warnings) else ()
+    )
+    return Clock(
+        one.clock_steps, one.readout, one.readout_std, max(stds, default=0.0), slews,
+        lag_z=error / one.lag_std if one.lag_std else 0.0,
+    )  # fmt: skip
 
 
 def run(task: tuple[str, int], world: World) -> Run:
@@ -137,19 +168,24 @@ def run(task: tuple[str, int], world: World) -> Run:
     except Refused:
         return Run({name: (clock, None) for name, clock in clocks.items()}, time.process_time() - began)
     cpu = time.process_time() - began
-    return Run({name: (clock, reported(found, name)) for name, clock in clocks.items()}, cpu)
+    return Run({name: (clock, reported(found, name, clocks)) for name, clock in clocks.items()}, cpu)
 
 
 def row(effect: str, runs: list[Run]) -> str:
     """The table's line of one effect."""
-    put = dict.fromkeys(("step", "readout", "jitter"), 0)
+    put = dict.fromkeys(("step", "readout", "jitter", "slew"), 0)
     found, wrong, z = dict(put), dict(put), {kind: list[float]() for kind in put}
     refused = 0
     for true, said in (pair for one in runs for pair in one.clocks.values()):
         if said is None:
             refused += 1
             continue
-        for kind, there in (("step", true.steps), ("readout", true.readout), ("jitter", true.jitter)):
+        for kind, there in (
+            ("step", true.steps),
+            ("readout", true.readout),
+            ("jitter", true.jitter),
+            ("slew", true.slews),
+        ):
             put[kind] += bool(there)
         hits = [
             (step, size - of, std)
@@ -167,6 +203,9 @@ def row(effect: str, runs: list[Run]) -> str:
         found["readout"] += true.readout > 0.0 and said.readout > 0.0
         found["jitter"] += true.jitter > 0.0 and said.jitter > 0.0
         wrong["jitter"] += true.jitter == 0.0 and said.jitter > 0.0
+        found["slew"] += bool(true.slews and said.slews)
+        wrong["slew"] += bool(said.slews and not true.slews)
+        z["slew"] += [] if said.steps or said.jitter else [said.lag_z]
         if true.jitter and said.jitter:
             z["jitter"].append(said.jitter / true.jitter)
     cells = [f"{found[kind]:>3} of {put[kind]:<3}{wrong[kind]:>3} wrong, {_rms(z[kind]):4.2f}" for kind in put]
@@ -195,7 +234,10 @@ def main() -> None:
         options.seconds, options.noise, tuple(map(float, options.fps.split(","))), options.fastest,
         options.focal_error, options.labels,
     )  # fmt: skip
-    print(f"{'effect':>20} refused  {'step: rms z':>22}   {'readout: rms z':>22}   {'jitter: of its truth':>22}")
+    print(
+        f"{'effect':>20} refused  {'step: rms z':>22}   {'readout: rms z':>22}   {'jitter: of its truth':>22}"
+        f"   {'slew: rms z of lags':>22}"
+    )
     with ProcessPoolExecutor(options.jobs) as pool:
         for effect in options.only.split(","):
             tasks = [(effect, seed) for seed in range(options.first, options.first + options.sessions)]

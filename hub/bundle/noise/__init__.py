@@ -1,1 +1,1 @@
-"""Noise of the observations: correlated errors, effective sample size, jitter of time stamps."""
+"""Noise of the observations: correlated errors, effective sample size, jitter of time stamps, wander of clocks."""

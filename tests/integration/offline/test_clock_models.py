@@ -31,7 +31,7 @@ def test_what_a_clock_does_is_reported_and_nothing_else(effect: str, world: Worl
     rig, observations, clocks = session(7001, effect, world)
     found = calibrate(rig, observations)
     for name, true in clocks.items():
-        said = reported(found, name)
+        said = reported(found, name, clocks)
         assert said is not None
         assert len(said.steps) == len(true.steps)
         for (at, size, _), (when, estimate, std) in zip(true.steps, said.steps, strict=True):

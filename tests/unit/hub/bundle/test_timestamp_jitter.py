@@ -58,7 +58,7 @@ def test_jitter_is_reported_and_affects_neither_poses_nor_stds(
         assert off <= 3.5 * camera.time_offset_std
         assert camera.time_offset_std < 0.15 * std
     monkeypatch.setattr(
-        hub.calibration.final_adjustment, "estimate_frame_times", lambda problem, state, *_: (problem, state)
+        hub.calibration.final_adjustment, "estimate_frame_times", lambda problem, state, *_, **__: (problem, state)
     )
     uncorrected = calibrate(session.rig, session.observations())
     assert turn_error(session, found) < 0.6 * turn_error(session, uncorrected)
@@ -73,7 +73,7 @@ def test_exact_timestamps_change_nothing(labels: int, monkeypatch: pytest.Monkey
     session = jittery(SEED, 0.0, labels, outliers=0.03)
     found = calibrate(session.rig, session.observations())
     monkeypatch.setattr(
-        hub.calibration.final_adjustment, "estimate_frame_times", lambda problem, state, *_: (problem, state)
+        hub.calibration.final_adjustment, "estimate_frame_times", lambda problem, state, *_, **__: (problem, state)
     )
     uncorrected = calibrate(session.rig, session.observations())
     assert not reported_jitters(found)

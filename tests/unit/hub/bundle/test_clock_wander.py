@@ -1,0 +1,64 @@
+"""Clocks whose rate changes: the curve beside an even clock, and lags that hold with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+
+from hub.bundle.noise.clock_wander import fit_wander
+from hub.calibration.pipeline import calibrate
+from tests.bench import clock_models
+from tests.support import rigs
+
+_WORLD = clock_models.World(60.0, 0.4, (30.0, 25.0, 29.97, 50.0), 0.7, 0.0, 1)
+
+
+@given(st.integers(0, 10**6))
+def test_an_even_clock_in_white_noise_does_not_wander(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    time = np.sort(random.uniform(0.0, 60.0, 900))
+    even = 1e-3 * random.normal() + 1e-4 * random.normal() * time
+    found = fit_wander(0, time, even + random.normal(0.0, 1e-3, 900), np.full(900, 1e6), 30.0)
+    assert found is not None
+    assert found.gain < 25.0  # one in four million
+    assert abs(float(found.at(np.array([30.0]))[0])) < 1e-9
+
+
+def test_a_slew_is_followed_within_its_noise_and_agrees_with_the_clock_at_the_instant() -> None:
+    random, time = np.random.default_rng(1), np.linspace(0.0, 60.0, 1800)
+    slew = 5e-4 * (np.maximum(time - 20.0, 0.0) - np.maximum(time - 40.0, 0.0))
+    found = fit_wander(0, time, slew + random.normal(0.0, 1e-3, 1800), np.full(1800, 1e6), 50.0)
+    assert found is not None
+    assert found.gain > 1000.0
+    off = found.at(time) - (slew - 0.01)  # 10 ms at 50 s, and no rate there
+    assert np.abs(off[np.abs(time - 50.0) < 2.0]).max() < 3e-4
+    assert np.abs(off - np.polyval(np.polyfit(time, off, 1), time)).max() < 1e-3
+    assert abs(np.polyfit(time, off, 1)[0]) < 3.0 * found.rate_std < 2e-4
+    assert 2e-5 < found.std < 3e-4
+
+
+@pytest.mark.parametrize("seed", [9103, 9105])
+def test_a_clock_that_a_service_slews_is_told_and_every_lag_holds(seed: int) -> None:
+    rig, observations, clocks = clock_models.session(seed, "slew500", _WORLD)
+    found = calibrate(rig, observations)
+    for name, true in clocks.items():
+        said = clock_models.reported(found, name, clocks)
+        assert said is not None
+        assert bool(said.slews) == bool(true.slews)
+        assert abs(said.lag_z) < 4.0
+
+
+def test_errors_that_last_are_no_wander() -> None:
+    session = rigs.simulate(41, 5, 40.0)
+    random, pixels = np.random.default_rng(41), session.pixels.copy()
+    for name in session.rig.cameras:
+        mine = np.flatnonzero([one == name for one in session.camera])
+        white = random.normal(0.0, 0.7 * np.sqrt(1.0 - 0.97**2), (len(mine), 2))
+        pixels[mine] += lfilter([1.0], [1.0, -0.97], white, axis=0)
+    found = calibrate(session.rig, replace(session, pixels=pixels).observations())
+    assert not [text for text in found.warnings if "rate changes" in text]
