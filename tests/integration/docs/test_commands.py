@@ -53,6 +53,13 @@ def test_the_documentation_names_commands() -> None:
     assert len(in_pages()) > 20
 
 
+def test_offline_commands_print_json_and_accept_a_seed() -> None:
+    """As docs/reference/commands.md says of all of them, also of those that draw nothing at random."""
+    offline = [name for name, place, _ in COMMANDS if place.startswith(("offline.", "data.", "agents.demo"))]
+    for option in ("--json", "--seed", "Example: syncline "):
+        assert [name for name in offline if option not in help_of(name)] == []
+
+
 def test_every_command_and_option_in_the_documentation_exists() -> None:
     wrong = []
     for file, line in in_pages():
