@@ -89,7 +89,7 @@ def build_app(called: str = "") -> App:
         help="Calibrate and synchronise cameras that share no clock, and track with them.\n\n"
         "Try `syncline demo`, or `syncline calibrate SESSION --out out`.",
         version=VERSION,
-        help_format="plaintext",
+        help_format="markdown",
         result_action="return_value",
         suppress_keyboard_interrupt=False,
     )

@@ -1,4 +1,4 @@
-"""What all tests share: how many examples the property tests try (`make fuzz` tries many more)."""
+"""What all tests share: how many examples the property tests try (`make fuzz` tries many more), without time limits."""
 
 from __future__ import annotations
 
@@ -13,4 +13,6 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 from hypothesis import settings  # noqa: E402
 
+settings.register_profile("default", deadline=None)
 settings.register_profile("fuzz", max_examples=1000, deadline=None)
+settings.load_profile("default")

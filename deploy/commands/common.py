@@ -49,10 +49,12 @@ def check_seed(seed: int) -> None:
         raise InputError(f"--seed {seed} is negative", remedy="give 0 or more")
 
 
-def check_file(out: Path, name: str) -> None:
-    """Raise InputError if ``out`` is a folder. name: of what it has to be."""
+def check_file(out: Path, name: str, *inputs: Path | None, option: str = "--out") -> None:
+    """Raise InputError if ``out`` is a folder, or one of the ``inputs``. name: of what it has to be."""
     if out.is_dir():
-        raise InputError("this is a folder, but a file is needed", file=out, remedy=f"give --out the name of {name}")
+        raise InputError("this is a folder, but a file is needed", file=out, remedy=f"give {option} the name of {name}")
+    if out.resolve() in [given.resolve() for given in inputs if given is not None]:
+        raise InputError("this file is read, and would be lost", file=out, remedy=f"give {option} another name")
 
 
 def refuse(options: Mapping[str, object], what: str) -> None:

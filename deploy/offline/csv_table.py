@@ -13,6 +13,7 @@ import numpy as np
 from protocols.core.errors import InputError
 from protocols.core.files import read_text
 from protocols.geometry.types import Bools, Floats, Ints
+from protocols.session.observations import check_columns, check_width
 
 _LARGEST_WHOLE = 2.0**53
 """Up to here a float represents every whole number."""
@@ -74,15 +75,10 @@ def read_csv_table(file: Path, what: str, required: Sequence[str], optional: Seq
     twice = [name for name in (*required, *optional) if header.count(name) > 1]
     if twice:
         raise InputError(f"column {twice[0]} is named twice", file=file, line=1, remedy="keep one")
-    missing = [name for name in required if name not in header]
-    if missing:
-        remedy = f"the first line must name {','.join(required)}"
-        raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
+    check_columns(header, required, file)
     place = {name: header.index(name) for name in (*required, *optional) if name in header}
     for row, line in zip(rows[1:], lines[1:], strict=True):
-        if len(row) <= max(place.values()):
-            what = f"{len(row)} columns where the first line has {len(header)}"
-            raise InputError(what, file=file, line=line, remedy="complete the row")
+        check_width(row, line, len(header), max(place.values()), file)
     if len(rows) == 1:
         raise InputError("no rows below its first line", file=file, line=1, remedy=f"give the rows of the {what}")
     return CsvTable(file, {name: [row[at] for row in rows[1:]] for name, at in place.items()}, lines[1:])

@@ -27,7 +27,7 @@ from edge.detectors.board.description import BOARD_FILE, Board
 from edge.detectors.board.detector import BoardDetector
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
-from edge.detectors.plugins import detector_revision, load_detector
+from edge.detectors.plugins import detector_revision, is_plugin, load_detector, unknown_detector
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav, is_video
 from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector
 from edge.offline.sound import ENERGY_RATE, sound_energy
@@ -123,8 +123,7 @@ def session_from_videos(
     Raises InputError if fewer than two videos can be read. Where auto finds nothing in them, the session is empty and
     carries the refusal.
     """
-    if detector not in DETECTORS:
-        load_detector(detector)  # one that is not usable fails once, not for every video
+    _check_detector(detector)
     folder, session = Path(folder), Path(session)
     videos, warnings = list_videos(folder)
     if len(videos) < 2:
@@ -188,6 +187,14 @@ def session_from_videos(
         return VideoSession(rig, Observations({}), tuple(warnings), folder.name, priors, tuple(lines), refusal)
     rig, observations = read_folder(session)
     return VideoSession(rig, observations, (*warnings, *observations.warnings), folder.name, priors, tuple(lines))
+
+
+def _check_detector(name: str) -> None:
+    """Raise InputError for a detector that is not known or not usable: once, not for every video."""
+    if name not in DETECTORS:
+        if not is_plugin(name):
+            raise unknown_detector(name, DETECTORS)
+        load_detector(name)
 
 
 def _oversized(board: Board, metadata: dict[str, Any]) -> list[str]:

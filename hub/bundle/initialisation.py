@@ -26,7 +26,7 @@ from hub.bundle.residuals import residual_norms
 from hub.clocks.clock_graph import ClockGraph
 from hub.sync.hypothesis import PairSolution, evidence
 from hub.trajectory.discrete import PointBasis, SampledTrack, merged_instants
-from hub.trajectory.image_tracks import ImageTrack
+from hub.trajectory.image_tracks import MAX_PAUSE_S, ImageTrack
 from hub.trajectory.splines import SplineBasis, fit_spline, split_at_gaps, weighted_sums
 from protocols.core.errors import Refused
 from protocols.geometry import so3
@@ -290,9 +290,7 @@ def triangulate_label(
         return None
     if all(isinstance(track, SampledTrack) for _, track in seeing):
         return _triangulate_instants(seeing)
-    begin = min(float(state.reference_time(track.time[:1])[0]) for state, track in seeing)
-    end = max(float(state.reference_time(track.time[-1:])[0]) for state, track in seeing)
-    time = np.arange(begin, end, _TRIANGULATION_STEP)
+    time = _times_of_two(seeing)
     points, good = linear_triangulation(seeing, time)
     if good.sum() < _MIN_PNP_POINTS:
         return None
@@ -309,6 +307,23 @@ def triangulate_label(
         weight = 1.0 / (1.0 + (distance / (3.0 * scale)) ** 2)
         control = fit_spline(basis, rows, points, weight, 1e-2)
     return Trajectory(basis, control)
+
+
+def _times_of_two(seeing: list[tuple[CameraState, ImageTrack]]) -> Floats:
+    """Reference times (n,) of a grid from the first row on at which two cameras may see a point.
+
+    Clocks that were set, or that are not those of the calibration, are years apart: a grid over all would not end.
+    """
+    spans = [split_at_gaps(state.reference_time(track.time), MAX_PAUSE_S) for state, track in seeing]
+    edges, cameras = np.concatenate(spans, axis=1).ravel(), sum(len(begins) for begins, _ in spans)
+    change = np.repeat([1, -1], cameras)
+    order = np.lexsort((-change, edges))
+    edges, shared = edges[order], np.cumsum(change[order])[:-1] >= 2
+    step = edges[0] + _TRIANGULATION_STEP - edges[0]  # as np.arange(first, last, step) rounds it
+    steps = (edges - edges[0]) / _TRIANGULATION_STEP
+    begins, ends = np.floor(steps[:-1][shared]), np.minimum(np.ceil(steps[1:][shared]) + 1, np.ceil(steps[-1]))
+    grid = [np.arange(begin, end) for begin, end in zip(begins, ends, strict=True)]
+    return np.asarray(edges[0] + np.unique(np.concatenate([np.zeros(0), *grid])) * step)
 
 
 def _triangulate_instants(seeing: list[tuple[CameraState, ImageTrack]]) -> Trajectory | None:

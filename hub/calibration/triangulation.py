@@ -56,8 +56,8 @@ def triangulate(
     report("smoothing the tracks", 0.1)
     lenses = {name: replace(rig.cameras[name], intrinsics=camera.intrinsics) for name, camera in known.items()}
     prepared = prepare(replace(rig, cameras=lenses), observations)
-    unused = dict(prepared.refused)
-    names = list(prepared.cameras)
+    unused = dict(prepared.refused) | _unshared(prepared, known)
+    names = [name for name in prepared.cameras if name not in unused]
     while True:
         if len(names) < 2:
             raise Refused(_too_few_cameras(names, unused), unused)
@@ -135,6 +135,20 @@ def _time_maps(
         rate = known[name].time_map.clock_rate
         clocks[name] = TimeMapEstimate(rate, starts[name] - common_start + rate * centre, centre)
     return clocks
+
+
+def _unshared(prepared: PreparedSession, known: Mapping[str, CameraCalibration]) -> dict[str, str]:
+    """Cameras that, by the given clocks, share no time with any other, and this as the reason."""
+    spans = {}
+    for name, clock in _time_maps(prepared, known, list(prepared.cameras)).items():
+        times = [time for part in prepared.rows[name] for time in (part.time.min(), part.time.max())]
+        spans[name] = [clock.rate * (time - clock.centre) + clock.offset for time in (min(times), max(times))]
+    reason = "by the calibration's clocks it shares no time with another camera: was its clock set anew?"
+    return {
+        name: reason
+        for name, (first, last) in spans.items()
+        if not any(first <= end and begin <= last for other, (begin, end) in spans.items() if other != name)
+    }
 
 
 def _on_reference_clock(

@@ -306,7 +306,7 @@ class LiveHub:
             return "collecting", missing
         if self.refusal is not None and self.refusal.permanent:
             return "refused", self.refusal.reason
-        return "searching", "searching" if self.refusal is None else f"searching: {self.refusal.reason}"
+        return "searching", "comparing all lags" if self.refusal is None else self.refusal.reason
 
     def frame_ages(self, now: float) -> dict[str, float]:
         """Seconds since the last frame of each camera that is calibrated or was heard of lately."""

@@ -201,10 +201,10 @@ def check_folder(folder: Path) -> None:
     try:
         if folder.exists() and not folder.is_dir():
             raise InputError("not a folder", file=folder, remedy="choose another --out")
-        for parent in folder.parents:
-            if parent.exists():
-                if not parent.is_dir():
-                    raise InputError(f"{parent} is not a folder", file=folder, remedy="choose another --out")
-                break
+        place = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+        if not place.is_dir():
+            raise InputError(f"{place} is not a folder", file=folder, remedy="choose another --out")
+        if not os.access(place, os.W_OK | os.X_OK):
+            raise InputError("may not be written to", file=place, remedy="choose another folder, or correct its rights")
     except OSError as error:
         raise InputError(f"cannot be a folder: {error.strerror}", file=folder, remedy="choose another --out") from None

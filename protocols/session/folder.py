@@ -13,7 +13,7 @@ from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
 from protocols.session.calibration import csv_cell
 from protocols.session.observations import Observations, read_observations
-from protocols.session.rig import Rig, read_rig
+from protocols.session.rig import Rig, misspelt_keys, read_rig
 
 RIG_FILE = "rig.toml"
 OBSERVATIONS_FILE = "observations.csv"
@@ -34,7 +34,7 @@ def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Ob
         )
     rig = read_rig(folder / RIG_FILE)
     found = read_observations(observations or folder / OBSERVATIONS_FILE, rig.cameras)
-    return rig, replace(found, warnings=found.warnings + out_of_image_warnings(rig, found))
+    return rig, replace(found, warnings=found.warnings + out_of_image_warnings(rig, found) + misspelt_keys(rig))
 
 
 def out_of_image_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:

@@ -161,10 +161,7 @@ def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) 
     twice = [name for name in used if header.count(name) > 1]
     if twice:
         raise InputError(f"column {twice[0]} is named twice", file=file, line=1, remedy="keep one")
-    missing = [name for name in REQUIRED if name not in columns]
-    if missing:
-        remedy = f"the first line must name {','.join(REQUIRED)}[,size][,label]"
-        raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
+    check_columns(header, REQUIRED, file, "[,size][,label]")
     rows: list[list[str]] = []
     lines: list[int] = []
     try:
@@ -176,7 +173,8 @@ def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) 
         raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
     if not rows:
         raise InputError("no rows", file=file, line=1, remedy="record some observations first")
-    _check_width(rows, lines, max(columns[name] for name in columns if name in used), file)
+    for row, line in zip(rows, lines, strict=True):
+        check_width(row, line, len(header), max(columns[name] for name in columns if name in used), file)
     numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
     far = np.flatnonzero(np.abs(numbers["time"]) > MAX_TIME_S)
     if len(far):
@@ -322,15 +320,21 @@ def _check_repeats(
     warnings.append(f"{where}: frame numbers repeat ({repeated} of {len(frame)}); only its times are used")
 
 
-def _check_width(rows: list[list[str]], lines: list[int], last: int, file: Path) -> None:
-    for row, line in zip(rows, lines, strict=True):
-        if len(row) <= last:
-            raise InputError(
-                f"{len(row)} columns where the first line has more",
-                file=file,
-                line=line,
-                remedy="complete the row",
-            )
+def check_columns(header: Sequence[str], required: Sequence[str], file: Path, optional: str = "") -> None:
+    """Raise InputError if a required column is missing in the first line of a CSV file."""
+    missing = [name for name in required if name not in header]
+    if missing:
+        remedy = f"the first line must name {','.join(required)}{optional}"
+        if len(header) == 1 and (found := [sign for sign in (";", "\t", "|") if sign in header[0]]):
+            remedy = f"its columns are separated by {found[0]!r}: separate them by commas, and decimals by points"
+        raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
+
+
+def check_width(row: Sequence[str], line: int, width: int, last: int, file: Path) -> None:
+    """Raise InputError for a row without its column ``last``, or with cells beyond the ``width`` of the first line."""
+    if len(row) <= last or any(cell.strip() for cell in row[width:]):
+        remedy = "complete the row" if len(row) <= last else "name every column; quote text with commas; decimal points"
+        raise InputError(f"{len(row)} columns where the first line has {width}", file=file, line=line, remedy=remedy)
 
 
 def _column(

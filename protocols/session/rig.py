@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -107,6 +108,25 @@ class Rig:
         """Up (3,) in a camera's axes: as its table gives it, otherwise the camera is taken as levelled."""
         up = self.cameras[camera].up
         return np.array([0.0, -1.0, 0.0]) if up is None else up
+
+
+_KEYS = {
+    *("name", "size", "fps", "matrix", "distortions", "fisheye", "focal_std", "readout", "ball_outline", "position"),
+    *("position_std", "rotation", "rotation_std", "translation", "body_from_camera", "up"),
+}
+_METADATA_KEYS = {"units", "clock", "reference", "distances", "wand", "up", "bodies"}
+_LIKENESS = 0.8  # of difflib: unit for units is 0.89, and no key of a calibration.toml is above 0.78
+
+
+def misspelt_keys(rig: Rig) -> tuple[str, ...]:
+    """Warnings for keys that are not read and look like one that is: they are kept, so that they are no errors."""
+    tables = [*((name, camera.table, _KEYS) for name, camera in rig.cameras.items())]
+    return tuple(
+        f"[{where}] {key} is no key of a rig and has no effect: did you mean {close[0]}?"
+        for where, table, known in (*tables, ("metadata", rig.metadata, _METADATA_KEYS))
+        for key in table
+        if key not in known and (close := difflib.get_close_matches(key.lower(), known, 1, _LIKENESS))
+    )
 
 
 class _Table:

@@ -55,6 +55,7 @@ def demo(
     check_seed(seed)
     check_range("--cameras", cameras, 2, 20)
     check_range("--seconds", seconds, 5.0, 3600.0)
+    check_range("--view-port", view_port, 0, 65535)
     if scene == "town":
         return _town(out, seconds, seed, view_port if view else None, as_json=json)
     from deploy.demo.display import ProgressDisplay

@@ -84,7 +84,7 @@ def export(
         if to in exports.IN_FOLDERS or session is not None:
             check_folder(out)
         else:
-            check_file(out, "a file")
+            check_file(out, "a file", source)
         texts: dict[Path, str] = {}
         if to == "c3d":
             write_c3d(source, out, units)

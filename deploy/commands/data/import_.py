@@ -87,7 +87,7 @@ def import_(
     """
     if not sources:
         raise InputError("nothing to import", remedy="give files, or a folder")
-    check_file(out, "a file")
+    check_file(out, "a file", *sources, calibration)
     check_rate(fps)
     check_range("--likelihood", likelihood, 0.0, 1.0)
     if fps is not None and videos is not None:

@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from deploy.commands.common import Flag, Json, answer
+from deploy.commands.common import Flag, Json, UnusedSeed, answer
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
 
-def info(path: Path, /, *, json: Json = False) -> int:
+def info(path: Path, /, *, json: Json = False, seed: UnusedSeed = 0) -> int:
     """Show the contents of a log (topics, counts, times, damage) or of a session folder.
 
     Example: syncline info demo-out/demo.mcap
@@ -42,7 +42,7 @@ def info(path: Path, /, *, json: Json = False) -> int:
     return EXIT_DONE
 
 
-def recover(log: Path, /, *, out: Path, json: Json = False) -> int:
+def recover(log: Path, /, *, out: Path, json: Json = False, seed: UnusedSeed = 0) -> int:
     """Recover a log that is damaged, truncated or was never closed, and report what was lost.
 
     Example: syncline recover flight.mcap --out fixed.mcap
@@ -97,6 +97,7 @@ def replay(
     site: str = "local",
     connect: list[str] | None = None,
     json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Publish the messages of a log on the bus at their recorded times, or compare two logs.
 

@@ -127,9 +127,11 @@ def detect(
         other = "`detect marker`" if what == "marker" else "--background"
         raise InputError(f"--detector cannot be used with {other}", remedy="leave one of them out")
     check_rate(fps)
-    check_file(out, "a CSV file")
-    if overlay is not None and (overlay.is_dir() or not overlay.parent.is_dir()):
-        raise InputError("cannot be written", file=overlay, remedy="give --overlay a file in a folder that exists")
+    check_file(out, "a CSV file", video, marker, rig)
+    if overlay is not None:
+        check_file(overlay, "a video", video, out, option="--overlay")
+        if not overlay.parent.is_dir():
+            raise InputError("cannot be written", file=overlay, remedy="give --overlay a file in a folder that exists")
     if teach != (target is not None):
         remedy = "give --teach --target x,y,w,h: the box of the marker in frame --start"
         raise InputError("--teach and --target go together", remedy=remedy)

@@ -68,7 +68,7 @@ def intrinsics(
     model
         Without a board: the camera model, such as gopro-wide, oak-d, pixel-main, logitech-c920, raspberry-pi-camera-3.
     """
-    check_file(out, "a rig.toml")
+    check_file(out, "a rig.toml", video)
     grid = parse_size("--squares", squares, "give squares across x down, at least 4x4: 8x5", 4, 999)
     check_range("--ratio", ratio, 0.1, 0.99, "give a marker's side as a share of a square's")
     widest = 175.0 if fisheye else 150.0

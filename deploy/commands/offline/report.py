@@ -6,7 +6,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from deploy.commands.common import Flag, Json, answer, closing_lines, open_browser
+from deploy.commands.common import Flag, Json, UnusedSeed, answer, closing_lines, open_browser
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 
 
@@ -17,6 +17,7 @@ def report(
     out: Path | None = None,
     session: Path | None = None,
     json: Json = False,
+    seed: UnusedSeed = 0,
     browser: Flag = False,
 ) -> int:
     """Write report.html for a result folder, a session or a log: the quality assessment first, then the evidence.

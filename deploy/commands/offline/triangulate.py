@@ -44,8 +44,10 @@ def triangulate(
     observations
         Another observations file to use instead of the session's own.
     """
-    check_file(out, "a CSV file")
     from hub.api import triangulate as solve
+    from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
+
+    check_file(out, "a CSV file", session, observations, calibration, session / OBSERVATIONS_FILE, session / RIG_FILE)
 
     with progress_bar(f"triangulating {session.name}", quiet=json) as progress:
         result = solve(session, calibration, progress, observations=observations)

@@ -28,7 +28,7 @@ KEYS = App(
     "Example: syncline keys issue keys --role camera --id cam0\n\n"
     "Example: syncline keys revoke keys --role camera --id cam0\n\n"
     "Example: syncline keys check keys",
-    help_format="plaintext",
+    help_format="markdown",
 )
 
 

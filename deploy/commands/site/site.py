@@ -28,7 +28,7 @@ SITE = App(
     "Example: syncline site renew site.toml\n\n"
     "Example: syncline site status site.toml\n\n"
     "On a board: request, accept, update, ready, restore.",
-    help_format="plaintext",
+    help_format="markdown",
 )
 
 

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from deploy.offline.follow.calibration import GivenCalibration
 from deploy.offline.follow.objects import (
     BOXES_FILE,
@@ -17,6 +19,7 @@ from deploy.offline.follow.objects import (
 )
 from deploy.offline.follow.units import check_units
 from hub.tracking.detections import TrackingCamera
+from hub.trajectory.image_tracks import MAX_PAUSE_S
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
 from protocols.log.read.reader import LogReader
@@ -103,8 +106,9 @@ def read_follow_input(
             videos = {video.camera: video.path for video in list_videos(session)[0]}
         if session.is_dir() and (session / RIG_FILE).exists():
             shared |= read_rig(session / RIG_FILE).shared_clock
+    messages, steps = _without_clock_steps(messages)
     found, left_out = followed_detections(messages, kind, known.sizes)
-    warnings = (*warnings, *more, *left_out.warnings)
+    warnings = (*warnings, *more, *steps, *left_out.warnings)
     unused = sorted({message.camera for message in messages} - known.sizes.keys())
     warnings += tuple(f"{name}: not followed in, the calibration refused it" for name in unused if name in known.names)
     strange = [name for name in unused if name not in known.names]
@@ -145,6 +149,22 @@ def _read_log(file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
         if len(count) > 1
     )
     return [message for message in messages if message.boot_id == boots[message.camera]], damage + restarts
+
+
+def _without_clock_steps(messages: list[pb.Observation]) -> tuple[list[pb.Observation], tuple[str, ...]]:
+    """The messages on the longer side of a step of their camera's clock, as `calibrate` takes it; and warnings."""
+    kept: dict[str, tuple[int, int]] = {}
+    warnings = []
+    for camera in dict.fromkeys(message.camera for message in messages):
+        times = np.sort([message.device_time_ns for message in messages if message.camera == camera])
+        gaps = np.diff(times / NANOSECONDS)
+        part = max(np.split(times, np.flatnonzero(gaps > MAX_PAUSE_S) + 1), key=len)
+        kept[camera] = int(part[0]), int(part[-1])
+        if len(part) < len(times):
+            left = f"{len(times) - len(part)} of {len(times)} frames on the other side are left out"
+            warnings.append(f"{camera}: its clock steps by {gaps.max():.0f} s; {left}")
+    left_in = [one for one in messages if kept[one.camera][0] <= one.device_time_ns <= kept[one.camera][1]]
+    return left_in, tuple(warnings)
 
 
 def _wanted_times(

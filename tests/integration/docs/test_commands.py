@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,24 @@ def in_pages() -> list[tuple[str, str]]:
 
 def test_the_documentation_names_commands() -> None:
     assert len(in_pages()) > 20
+
+
+def test_offline_commands_print_json_and_accept_a_seed() -> None:
+    """As docs/reference/commands.md says of all of them, also of those that draw nothing at random."""
+    offline = [name for name, place, _ in COMMANDS if place.startswith(("offline.", "data.", "agents.demo"))]
+    for option in ("--json", "--seed", "Example: syncline "):
+        assert [name for name in offline if option not in help_of(name)] == []
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_paragraphs_of_a_help_fill_a_narrow_terminal(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lines of a docstring are wider than 80 columns: broken once more, every second one had a few words."""
+    monkeypatch.setenv("COLUMNS", "80")
+    paragraphs = help_of.__wrapped__(name).split("╭")[0].split("\n\n")
+    for paragraph in paragraphs:
+        lines = [line.strip() for line in paragraph.strip().splitlines()]
+        full = [len(line) + 1 + len(following.split()[0]) > 76 for line, following in pairwise(lines)]
+        assert all(full), paragraph
 
 
 def test_every_command_and_option_in_the_documentation_exists() -> None:

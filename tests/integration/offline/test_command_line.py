@@ -149,6 +149,7 @@ def test_one_camera_is_refused_with_a_report_and_no_calibration(
         ["simulate", "atlantis", "--out", "x"],
         ["simulate", "marker", "--out", "x", "--cameras", "1"],
         ["demo", "--cameras", "1"],
+        ["demo", "--view", "--view-port", "99999"],
         ["camera", "missing.toml"],
         ["info", "missing.mcap"],
         ["replay", "missing.mcap", "--rate", "fast"],

@@ -154,12 +154,15 @@ def test_one_file_that_cannot_be_written_leaves_none(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["second"]
 
 
-@pytest.mark.parametrize("out", ["file", "file/below", "x" * 300])
+@pytest.mark.parametrize("out", ["file", "file/below", "x" * 300, "locked", "locked/below"])
 def test_an_output_folder_that_cannot_be_is_told_before_the_work(
-    filmed: Session, tmp_path: Path, out: str, capsys: pytest.CaptureFixture[str]
+    filmed: Session, tmp_path: Path, out: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = write_session(tmp_path / "session", filmed)
     (tmp_path / "file").write_text("")
+    (tmp_path / "locked").mkdir()
+    # Who runs the tests may have all rights.
+    monkeypatch.setattr("protocols.core.files.os.access", lambda place, mode: Path(place).name != "locked")
     assert run(["calibrate", str(folder), "--out", str(tmp_path / out)]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 

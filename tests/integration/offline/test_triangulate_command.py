@@ -89,6 +89,57 @@ def test_a_camera_that_was_moved_is_reported_and_left_out(session: Path, tmp_pat
     assert np.sqrt(np.mean(off**2)) < 1e-2
 
 
+@pytest.mark.parametrize("cameras", [["cam2"], ["cam0", "cam1", "cam2"]])
+def test_a_clock_that_was_set_by_years_is_named_at_once(
+    session: Path, tmp_path: Path, capsys: Capture, cameras: list[str]
+) -> None:
+    """A grid over all times between the first and the last row would have 10¹¹ of them."""
+    truth = tomllib.loads((session / "truth_calibration.toml").read_text())
+    known, out = tmp_path / "known.toml", tmp_path / "track.csv"
+    for index, name in enumerate(cameras, start=1):
+        truth[name]["time_offset"] += 1.7e9 * index
+    known.write_text(tomli_w.dumps(truth))
+    status = run(["triangulate", str(session), "--calibration", str(known), "--out", str(out), "--json"])
+    printed = capsys.readouterr()
+    assert status == (0 if cameras == ["cam2"] else 3)
+    assert "cam2: by the calibration's clocks it shares no time" in printed.err or "cam2" in printed.out
+
+
+def test_two_halves_a_day_apart_are_both_triangulated(session: Path, tmp_path: Path) -> None:
+    """Pairs of cameras whose clocks agree with each other, and with no other pair."""
+    tables = tomllib.loads((session / "truth_calibration.toml").read_text())
+    header, *lines = (session / "observations.csv").read_text().splitlines()
+    for name in ("cam0", "cam1"):
+        later = name + "-later"
+        tables[later] = tables[name] | {"name": later, "time_offset": tables[name]["time_offset"] + 86_400.0}
+        lines += [line.replace(name, later, 1) for line in lines if line.startswith(name + ",")]
+    lines = [line for line in lines if not line.startswith("cam2")]
+    (tmp_path / "known.toml").write_text(tomli_w.dumps(tables))
+    (tmp_path / "rows.csv").write_text("\n".join([header, *lines]) + "\n")
+    out = tmp_path / "track.csv"
+    known = str(tmp_path / "known.toml")
+    assert run(["triangulate", str(tmp_path / "rows.csv"), "--calibration", known, "--out", str(out)]) == 0
+    time = np.genfromtxt(out, delimiter=",", skip_header=1, usecols=0)
+    assert (np.diff(time) > 86_000).sum() == 1
+
+
+def test_no_input_is_overwritten(session: Path, tmp_path: Path, capsys: Capture) -> None:
+    """Neither the labels nor the calibration, whatever the file is called on the way to it."""
+    copy = tmp_path / "copy"
+    shutil.copytree(session, copy)
+    (tmp_path / "link").symlink_to(copy)
+    before = {file.name: file.read_bytes() for file in copy.iterdir()}
+    known = copy / "truth_calibration.toml"
+    for name in ("observations.csv", "rig.toml", "truth_calibration.toml"):
+        arguments = ["triangulate", str(copy), "--calibration", str(known), "--out", str(tmp_path / "link" / name)]
+        assert run(arguments) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert f"{name}: this file is read, and would be lost" in line
+    for arguments in (["export", "--to", "kalibr"], ["import"]):
+        assert run([*arguments, str(known), "--out", str(known)]) == 2
+    assert {file.name: file.read_bytes() for file in copy.iterdir()} == before
+
+
 @pytest.mark.parametrize("change", ["pose", "clock", "epoch"])
 def test_a_calibration_that_contradicts_the_rows_is_refused(
     session: Path, tmp_path: Path, capsys: Capture, change: str

@@ -254,6 +254,17 @@ def test_wrong_use_of_detect_gives_one_line_of_error(
     assert not (tmp_path / "out.csv").exists()
 
 
+@pytest.mark.parametrize("options", [["--out", "VIDEO"], ["--out", "OUT", "--overlay", "VIDEO"]])
+def test_detect_does_not_overwrite_its_video(tmp_path: Path, capsys: Capture, options: list[str]) -> None:
+    video = tmp_path / "a.mp4"
+    write_video(video, [numbered_image(i) for i in range(5)], np.arange(5) / 10)
+    before = video.read_bytes()
+    words = [{"VIDEO": str(video), "OUT": str(tmp_path / "out.csv")}.get(word, word) for word in options]
+    assert run(["detect", "marker", str(video), *words]) == 2
+    assert "a.mp4: this file is read, and would be lost" in capsys.readouterr().err
+    assert video.read_bytes() == before
+
+
 # Numbered videos on two clocks: reference = 1.0 t for a, 1.0001 t + 0.25 for b.
 MAPS = {"a": (1.0, 0.0), "b": (1.0001, 0.25)}
 

@@ -74,7 +74,7 @@ def test_calibrate_refuses_what_is_no_detector(
     videos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, message in (
-        ("yolo", "there is no detector 'yolo'; use one of person, vehicle"),
+        ("yolo", "there is no detector 'yolo'; use one of charuco, chessboard, tag"),
         ("yolo.onnx", "there is no detector 'yolo.onnx'; give the .toml file that describes the network"),
         (str(tmp_path / "none.toml"), "this network's file does not exist"),
     ):

@@ -97,7 +97,7 @@ def test_rows_are_wanted_at_the_reference_cameras_frames_or_at_a_rate(tmp_path: 
     assert source.times_ns == [round(2e8 * frame) for frame in range(10)]
     assert read(tmp_path, boxes_csv(2.0, 5.0), fps=10.0).times_ns == [round(1e8 * index) for index in range(19)]
     with pytest.raises(InputError, match="--fps"):
-        read(tmp_path, boxes_csv(2.0, 5.0) + "left,99999,99999999,100,200,40,160\n", fps=1000.0)
+        read(tmp_path, boxes_csv(2.0, 5.0) + "left,99999,39999,100,200,40,160\n", fps=1000.0)
 
 
 def test_lags_of_the_calibration_are_applied(tmp_path: Path) -> None:
@@ -107,6 +107,15 @@ def test_lags_of_the_calibration_are_applied(tmp_path: Path) -> None:
     source = read_follow_input(tmp_path, known, "person", tmp_path)
     assert source.times_ns[0] == 0
     assert source.frame_times(known)[1] == pytest.approx(0.2)
+
+
+def test_a_time_that_is_a_clock_step_away_is_left_out_by_name(tmp_path: Path) -> None:
+    """One such row had all people refused."""
+    lines = [f"{camera},{frame},{frame / 10},100,200,40,160\n" for camera in ("left", "right") for frame in range(5)]
+    source = read(tmp_path, BOXES + "".join(lines) + "left,5,1e9,100,200,40,160\n")
+    assert [message.camera for message in source.observations].count("left") == 5
+    (warning,) = source.warnings
+    assert warning == "left: its clock steps by 1000000000 s; 1 of 6 frames on the other side are left out"
 
 
 def test_boxes_without_heights_are_asked_for_heights_not_for_points(tmp_path: Path) -> None:

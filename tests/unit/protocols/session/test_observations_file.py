@@ -153,6 +153,11 @@ def test_a_missing_column_is_reported(tmp_path: Path, column: str) -> None:
     assert_reported(tmp_path, (HEAD + ROWS).replace(column, "other", 1), 1, f"column {column} is missing")
 
 
+@pytest.mark.parametrize("sign", [";", "\t", "|"])
+def test_another_separator_is_called_one(tmp_path: Path, sign: str) -> None:
+    assert_reported(tmp_path, (HEAD + ROWS).replace(",", sign), 1, f"separated by {sign!r}: separate them by commas")
+
+
 def test_a_column_named_twice_is_reported(tmp_path: Path) -> None:
     """Which of the two is meant nobody knows."""
     assert_reported(tmp_path, "camera,frame,time,u,v,u\na,0,0,1,2,9\n", 1, "u")
@@ -176,7 +181,8 @@ def test_a_column_named_twice_is_reported(tmp_path: Path) -> None:
         ("c,2,10.2,1,2", "'c'"),
         (",2,10.2,1,2", "camera"),
         ("A,2,10.2,1,2", "'A'"),
-        ("a,2,10.2,1", "columns"),
+        ("a,2,10.2,1", "4 columns where the first line has 5"),
+        ("a,2,10,2,1,2", "6 columns where the first line has 5"),
         ('a,2,10.2,1,"2', ""),
     ],
 )

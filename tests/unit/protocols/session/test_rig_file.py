@@ -9,7 +9,7 @@ import pytest
 
 from protocols.core.errors import EXIT_INPUT, InputError
 from protocols.geometry import so3
-from protocols.session.rig import Rig, read_rig
+from protocols.session.rig import Rig, misspelt_keys, read_rig
 
 LENS = "matrix = [[900.0, 0, 640.0], [0, 901.0, 360.0], [0, 0, 1]]\ndistortions = [0.1, 0, 0, 0, 0]\n"
 CAM0 = f'[cam0]\nname = "cam0"\nsize = [1280, 720]\nfps = 30\n{LENS}'
@@ -35,6 +35,20 @@ def assert_reported(tmp_path: Path, text: str | bytes, line: int | None, *words:
     assert error.remedy in message
     for word in words:
         assert word in message, message
+
+
+@pytest.mark.parametrize(
+    ("text", "warnings"),
+    [
+        (f"{CAM0}distortion = [1]\npostion = [0, 0, 1]\n{CAM1}", ["[cam0] distortion", "[cam0] postion"]),
+        (f"{CAM0}[metadata]\nunit = 'mm'\ndistance = []\nClock = 'shared'\n", ["[metadata] unit"]),
+        (f"{CAM0}notes = 'new tripod'\ntime_offset = 1.0\nreadout_std = 0.1\n[metadata]\nscale = 'metric'\n", []),
+    ],
+)
+def test_a_misspelt_key_is_kept_and_warned_of(tmp_path: Path, text: str, warnings: list[str]) -> None:
+    found = misspelt_keys(read(tmp_path, text))
+    assert [line.split(" is no key")[0] for line in found][: len(warnings)] == warnings
+    assert bool(found) == bool(warnings)
 
 
 def test_a_full_rig_is_read(tmp_path: Path) -> None:
