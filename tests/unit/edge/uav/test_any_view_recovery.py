@@ -268,6 +268,20 @@ def test_a_box_that_stands_beside_something_that_moves_learns_from_clear_evidenc
     assert (tracker._filter._filter is not known) is learns
 
 
+@pytest.mark.parametrize(("ratio", "learns"), [(2.0, True), (-40.0, False)])
+def test_what_scores_the_target_is_learnt_from_frames_that_show_it(
+    scene: Image, monkeypatch: pytest.MonkeyPatch, ratio: float, learns: bool
+) -> None:
+    answer = Response(0.0, 0.0, 0.2, 1.6)
+    monkeypatch.setattr(AppearanceTracker, "_measured", lambda of, image, box: (box, 0.4, ratio, answer))
+    tracker, place = AppearanceTracker(SIZE, FPS), np.array([120.0, 120.0])
+    tracker.begin(painted(scene, place), 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
+    first = tracker._memory.tracking_ratio(0.4), tracker._filter._on.mean
+    tracker.handle_frame(painted(scene, place), 1 / FPS)
+    assert (tracker._memory.tracking_ratio(0.4) > first[0] + 0.1) is learns
+    assert (tracker._filter._on.mean < first[1] - 0.05) is learns
+
+
 def test_for_a_target_that_stands_what_moves_is_no_evidence(scene: Image) -> None:
     _, residual, place = watched(scene, 0.0)
     assert residual.moves < 0.3
