@@ -219,16 +219,16 @@ class AppearanceTracker:
             self._miss(dt)
             return
         residual = self._parts.residual(self._time, self.box, _MOVED * self.length)
-        box, score, ratio = self._measured(image, self.box)
+        box, score, ratio, answer = self._measured(image, self.box)
         moving, moved = residual.peaks(box.extent, 2), residual.log_ratio(box.centre)
         if moved < _STANDS:
             # It moved, and what is here stands: it may have slipped off.
             for place in moving:
-                other, *seen = self._measured(image, box.at(place))
-                moves = residual.log_ratio(other.centre)
-                far = float(np.hypot(*(other.centre - self.box.centre))) / self.length
-                if seen[1] + moves - 0.5 * (far / _SLIP_STD) ** 2 > ratio + moved + _SUPPORT:
-                    box, (score, ratio), moved = other, seen, moves
+                seen = self._measured(image, box.at(place))
+                moves = residual.log_ratio(seen[0].centre)
+                far = float(np.hypot(*(seen[0].centre - self.box.centre))) / self.length
+                if seen[2] + moves - 0.5 * (far / _SLIP_STD) ** 2 > ratio + moved + _SUPPORT:
+                    (box, score, ratio, answer), moved = seen, moves
         self._ratio = ratio + min(moved, 0.0)  # that something moves is no reason to learn what it looks like
         # What stands beside something that moves may have slipped off it: only clear evidence is learnt from.
         self._learn_above = _CERTAIN if moving and moved <= 0.0 else _LEARN_ABOVE
@@ -241,6 +241,9 @@ class AppearanceTracker:
         # It can only be there if it is in the filter's window at all.
         self._belief.doubt(math.erf(_WINDOW * self.length / self._motion_filter.std / math.sqrt(2.0)) ** 2)
         self._belief.add(ratio, dt)
+        if box.share_inside(self._size) > _LEARN_INSIDE:  # what scores the target, by expectation maximisation
+            self._memory.confirm(score, self._belief.probability)
+            self._filter.confirm(answer, self._belief.probability)
         if self._belief.visible:
             self._accept(image, box, score, dt)
         else:
@@ -251,12 +254,12 @@ class AppearanceTracker:
         elif not self.certain and self._frame % _OBSERVE_DOUBTFUL_EVERY == 0:
             self._observe_rivals(image, box)
 
-    def _measured(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, float, float]:
-        """The target about a box: where, its similarity, and the log likelihood ratio by that, filter and colour."""
+    def _measured(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, float, float, Response]:
+        """The target about a box: where, its similarity, the log likelihood ratio by it, filter, colour; the answer."""
         box, answer = self._respond(image, box)
         score = self._memory.score(image, box)
         colour = _COLOUR_SHARE * self._colour.log_ratio(image, box)
-        return box, score, self._memory.tracking_ratio(score) + answer.log_ratio + colour
+        return box, score, self._memory.tracking_ratio(score) + answer.log_ratio + colour, answer
 
     def _accept(self, image: Image, box: OrientedBox, score: float, dt: float) -> None:
         self._missed, self._unseen_s = 0, 0.0
@@ -298,7 +301,6 @@ class AppearanceTracker:
             self._filter.learn(image, box, self._memory.agrees(float(self._memory.first_scores(image, [box])[0])))
         else:
             self._scale.learn(image, box)
-        self._memory.confirm(score)
         self._colour.learn(image, box)
         if self._frame % _OBSERVE_EVERY == 0:
             self._memory.add(image, box)

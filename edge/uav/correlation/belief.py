@@ -35,6 +35,11 @@ class Belief:
         self.log_odds = float(np.clip(before + min(1.0, _LOOKS_RATE * dt) * log_ratio, -_LIMIT, _LIMIT))
 
     @property
+    def probability(self) -> float:
+        """That the box is on the target."""
+        return float(1.0 / (1.0 + np.exp(-self.log_odds)))
+
+    @property
     def visible(self) -> bool:
         """Whether the last frame shows the target, rather than not."""
         return self.now > 0.0 and self.log_odds > 0.0

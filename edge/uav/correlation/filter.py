@@ -15,6 +15,7 @@ import scipy.fft
 
 from edge.uav.base import Image
 from edge.uav.correlation.features import CHANNELS, Features, cell_features
+from edge.uav.correlation.memory import CHANGED, RunningNormal
 from edge.uav.correlation.oriented_box import OrientedBox, crop
 
 _CELL = 4  # [px]
@@ -25,7 +26,6 @@ _ITERATIONS, _PENALTY, _PENALTY_GROWTH, _REGULARISATION = 3, 5.0, 3.0, 0.01  # o
 _LEARNING_RATE = 0.05  # every second frame: 0.025 a frame as in DSST (Danelljan et al. 2014)
 _FIRST_VIEWS, _FORGETTING = 4, 0.02  # that the filter of the whole past begins with; share of a later one in it
 _ON, _OFF = (1.1, 0.4), (0.1, 0.3)  # mean and std of the log of the ratio, on the target and off it
-_CHANGED = 0.2  # share of the frames in which the target does not look as before
 _LIMIT = 3.0  # of the log likelihood ratio
 _CENTRE_STD = 0.8  # of the mask, over half a side: a box's corners show background
 
@@ -37,21 +37,27 @@ class Response:
     """Peak of the filter's answer. x, y: offset of the target from the window's centre [image px].
 
     peak: height; 1 where the target looks as it was learnt. ratio: what the filter of the whole past answers at the
-    same place, over its highest answer elsewhere in the window.
+    same place, over its highest answer elsewhere in the window; on: mean and std of its log on this target.
     """
 
     x: float
     y: float
     peak: float
     ratio: float
+    on: tuple[float, float] = _ON
+
+    @property
+    def log(self) -> float:
+        """Natural logarithm of the ratio."""
+        return float(np.log(max(self.ratio, 1e-3)))
 
     @property
     def log_ratio(self) -> float:
         """log p(ratio | on the target) - log p(ratio | on the background), natural, bounded."""
-        value = np.log(max(self.ratio, 1e-3))
+        value = self.log
         off = float(np.exp(-0.5 * (max(value - _OFF[0], 0.0) / _OFF[1]) ** 2)) / _OFF[1]
-        on = float(np.exp(-0.5 * (min(value - _ON[0], 0.0) / _ON[1]) ** 2)) / _ON[1]
-        return float(min(np.log(((1.0 - _CHANGED) * on + _CHANGED * off) / off), _LIMIT))
+        on = float(np.exp(-0.5 * (min(value - self.on[0], 0.0) / self.on[1]) ** 2)) / self.on[1]
+        return float(min(np.log(((1.0 - CHANGED) * on + CHANGED * off) / off), _LIMIT))
 
 
 class CorrelationFilter:
@@ -81,6 +87,7 @@ class CorrelationFilter:
         self._filter: Spectrum | None = None
         self._past: Spectrum | None = None  # mean of all that was learnt, against drift
         self._count = 0
+        self._on = RunningNormal(*_ON, 4.0, 60.0)
         self._weights = np.full((CHANNELS, 1, 1), 1.0 / CHANNELS, np.float32)
 
     def learn(self, image: Image, box: OrientedBox, lasting: bool = True) -> None:
@@ -116,7 +123,12 @@ class CorrelationFilter:
         dx = self._dx[0][row, column] + refined(answer[row], column)
         dy = self._dx[1][row, column] + refined(answer[:, column], row)
         offset = box.axes @ (np.array([dx, dy]) * box.sides * self._window / np.array(self._cells))
-        return Response(float(offset[0]), float(offset[1]), peak, max(near, 0.0) / max(other, 1e-3))
+        ratio, on = max(near, 0.0) / max(other, 1e-3), (self._on.mean, self._on.std)
+        return Response(float(offset[0]), float(offset[1]), peak, ratio, on)
+
+    def confirm(self, answer: Response, probability: float) -> None:
+        """Learn what the filter answers on the target; probability: that this is it."""
+        self._on.add(answer.log, probability)
 
     def _spectrum(self, image: Image, box: OrientedBox) -> Spectrum:
         patch = crop(image, box.sized(box.sides * self._window), self._patch)

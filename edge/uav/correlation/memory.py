@@ -28,12 +28,13 @@ _LOOK_ALIKES = 0.5  # places as similar as the target that are taken to have bee
 _PLACES = 300.0  # number of places that this start is worth
 _MIN_STD = 0.07  # of a score of the same thing, from one image to another
 _MAX_SCANNED = 4  # templates with which a region is searched
+CHANGED = 0.2  # share of the frames in which the target does not look as before
 _COLOUR_WEIGHT = np.float32(1.3)
 _CENTRED = np.float32(0.5)  # share of a channel's mean that is taken out
 
 
 @dataclass(slots=True)
-class _Normal:
+class RunningNormal:
     """A running normal distribution. weight: number of observations that the start is worth."""
 
     mean: float
@@ -41,9 +42,10 @@ class _Normal:
     weight: float
     limit: float
 
-    def add(self, value: float) -> None:
-        self.weight = min(self.weight + 1.0, self.limit)
-        gain = 1.0 / self.weight
+    def add(self, value: float, count: float = 1.0) -> None:
+        """Add an observation, or the share ``count`` of one."""
+        self.weight = min(self.weight + count, self.limit)
+        gain = count / self.weight
         step = value - self.mean
         self.mean += gain * step
         self.std = float(np.sqrt(max((1.0 - gain) * (self.std**2 + gain * step * step), 1e-6)))
@@ -57,9 +59,9 @@ class TemplateMemory:
         self._used: list[int] = []
         self._count = 0
         # Before anything was seen: a target changes by about a tenth from frame to frame.
-        self._target = _Normal(0.8, 0.15, 4.0, 60.0)
-        self._background = _Normal(0.2, 0.2, 2.0, 200.0)
-        self._rival = _Normal(0.4, 0.1, 1.0, 6.0)
+        self._target = RunningNormal(0.8, 0.15, 4.0, 60.0)
+        self._background = RunningNormal(0.2, 0.2, 2.0, 200.0)
+        self._rival = RunningNormal(0.4, 0.1, 1.0, 6.0)
         self._spectra: dict[tuple[int, int, int], npt.NDArray[np.complex64]] = {}
         self._tail = np.zeros(_TAIL_BINS)
         self._places = _PLACES
@@ -149,22 +151,25 @@ class TemplateMemory:
         return float(target + other - np.logaddexp(background, np.log(tail)))
 
     def tracking_ratio(self, score: float) -> float:
-        """log p(score | on the target) - log p(score | slipped on to the most similar place beside it), natural.
+        """log p(score | on the target) - log p(score | slipped off it), natural.
 
-        Both have a wide tail: a target that turns away, and a place that looks like it, come without notice.
+        What it has slipped on to is the most similar place beside it, or any other. Both have a wide tail: a target
+        that turns away, and a place that looks like it, come without notice.
         """
-        t, r = self._target, self._rival
-        on = 0.9 * _density(min(score - t.mean, 0.0), max(t.std, _MIN_STD)) + 0.1
-        off = 0.95 * _density(max(score - r.mean, 0.0), max(r.std, _MIN_STD)) + 0.05
+        t, r, b = self._target, self._rival, self._background
+        on = (1.0 - CHANGED) * _density(min(score - t.mean, 0.0), max(t.std, _MIN_STD)) + CHANGED
+        rival = _density(score - r.mean, max(r.std, _MIN_STD))
+        other = _density(max(score - b.mean, 0.0), max(b.std, _MIN_STD))
+        off = 0.95 * 0.5 * (rival + other) + 0.05
         return float(np.log(on / off))
 
     def observe_rival(self, score: float) -> None:
         """Learn what the most similar place beside the target scores."""
         self._rival.add(score)
 
-    def confirm(self, score: float) -> None:
-        """Learn what the target scores."""
-        self._target.add(score)
+    def confirm(self, score: float, probability: float) -> None:
+        """Learn what the target scores; probability: that this is it."""
+        self._target.add(score, probability)
 
     def observe_background(self, scores: Floats, places: float) -> None:
         """Learn what places beside the target score. scores: (n,) of the best; places: number of boxes searched."""

@@ -241,7 +241,9 @@ def test_a_box_that_stands_goes_to_what_moves_no_further_than_it_can_have_slippe
     ratio[120, round(120 + offset)] = 20.0
     residual = Residual(ratio, 1.0, np.zeros(2), 0.9, 0.05)
     monkeypatch.setattr(MovingParts, "residual", lambda *of: residual)
-    monkeypatch.setattr(AppearanceTracker, "_measured", lambda of, image, box: (box, 0.7, 4.0 * (box.x > 125.0)))
+    answer = Response(0.0, 0.0, 0.2, 1.0)
+    found = lambda of, image, box: (box, 0.7, 4.0 * (box.x > 125.0), answer)  # noqa: E731
+    monkeypatch.setattr(AppearanceTracker, "_measured", found)
     tracker, place = AppearanceTracker(SIZE, FPS), np.array([120.0, 120.0])
     tracker.begin(painted(scene, place), 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
     tracker.handle_frame(painted(scene, place), 1 / FPS)
@@ -255,15 +257,29 @@ def test_a_box_that_stands_beside_something_that_moves_learns_from_clear_evidenc
     """The filter of a truck had learnt the palms it had slipped off to, and claimed them while the truck was away."""
     moving = np.full((SIZE[1], SIZE[0]), 1.0, np.float32)
     moving[120, 160] = 20.0 if beside else 1.0
-    residual = Residual(moving, 1.0, np.zeros(2), 0.1, 0.05)
+    residual, answer = Residual(moving, 1.0, np.zeros(2), 0.1, 0.05), Response(0.0, 0.0, 0.2, 1.0)
     monkeypatch.setattr(MovingParts, "residual", lambda *of: residual)
-    monkeypatch.setattr(AppearanceTracker, "_measured", lambda of, image, box: (box, 0.7, ratio))
+    monkeypatch.setattr(AppearanceTracker, "_measured", lambda of, image, box: (box, 0.7, ratio, answer))
     tracker, place = AppearanceTracker(SIZE, FPS), np.array([120.0, 120.0])
     tracker.begin(painted(scene, place), 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
     known = tracker._filter._filter
     for k in range(1, 4):
         assert tracker.handle_frame(painted(scene, place), k / FPS).state is TrackState.VISIBLE
     assert (tracker._filter._filter is not known) is learns
+
+
+@pytest.mark.parametrize(("ratio", "learns"), [(2.0, True), (-40.0, False)])
+def test_what_scores_the_target_is_learnt_from_frames_that_show_it(
+    scene: Image, monkeypatch: pytest.MonkeyPatch, ratio: float, learns: bool
+) -> None:
+    answer = Response(0.0, 0.0, 0.2, 1.6)
+    monkeypatch.setattr(AppearanceTracker, "_measured", lambda of, image, box: (box, 0.4, ratio, answer))
+    tracker, place = AppearanceTracker(SIZE, FPS), np.array([120.0, 120.0])
+    tracker.begin(painted(scene, place), 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
+    first = tracker._memory.tracking_ratio(0.4), tracker._filter._on.mean
+    tracker.handle_frame(painted(scene, place), 1 / FPS)
+    assert (tracker._memory.tracking_ratio(0.4) > first[0] + 0.1) is learns
+    assert (tracker._filter._on.mean < first[1] - 0.05) is learns
 
 
 def test_for_a_target_that_stands_what_moves_is_no_evidence(scene: Image) -> None:

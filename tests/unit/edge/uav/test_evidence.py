@@ -132,6 +132,36 @@ def test_a_template_is_kept_only_where_the_first_view_still_agrees(scene: np.nda
     assert memory.score(image, background) == pytest.approx(before)
 
 
+def test_a_target_that_never_looks_the_same_is_not_doubted_for_it() -> None:
+    """A person who walks scores no more than what is beside, from the first frames on."""
+    memory, sure = TemplateMemory(), 0.9
+    for score in (0.45, 0.5, 0.4):
+        memory.observe_rival(score)
+    assert memory.tracking_ratio(0.45) < -1.5
+    memory.confirm(0.45, 1e-3)  # this was hardly the target
+    assert memory.tracking_ratio(0.45) < -1.5
+    for _ in range(6):
+        memory.confirm(0.45, sure)
+    assert memory.tracking_ratio(0.45) > -1.0
+    weak = Response(0.0, 0.0, 0.2, 1.6)
+    correlation = CorrelationFilter(8.0, 24.0)
+    image = np.random.default_rng(1).integers(0, 256, (60, 60, 3), np.uint8)
+    correlation.learn(image, OrientedBox(30.0, 30.0, 8.0, 24.0))
+    for _ in range(6):
+        correlation.confirm(weak, sure)
+    on = correlation.respond(image, OrientedBox(30.0, 30.0, 8.0, 24.0)).on
+    assert weak.log_ratio < -0.3
+    assert Response(0.0, 0.0, 0.2, 1.6, on).log_ratio > 0.0
+
+
+def test_what_is_less_like_the_target_than_its_rivals_is_not_one_of_them() -> None:
+    memory = TemplateMemory()
+    for _ in range(20):
+        memory.observe_rival(0.85)
+    assert memory.tracking_ratio(0.5) > memory.tracking_ratio(0.85)
+    assert memory.tracking_ratio(0.1) < -1.0, "nor is it the target: background scores that"
+
+
 def track(images: list[np.ndarray], x: float, y: float) -> list[TrackState]:
     tracker = AppearanceTracker(SIZE, FPS)
     box = Box(x - TARGET[0] / 2, y - TARGET[1] / 2, float(TARGET[0]), float(TARGET[1]))
