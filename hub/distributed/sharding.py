@@ -35,9 +35,9 @@ class OverlapMeter:
     def __init__(self) -> None:
         self._bins: deque[tuple[int, set[tuple[str, str]]]] = deque()
 
-    def observe(self, camera: str, labels: Iterable[str], arrival: float) -> None:
-        """What a camera saw; arrival: on the hub's clock [s]."""
-        bin_number = int(arrival // BIN_S)
+    def observe(self, camera: str, labels: Iterable[str], now: float) -> None:
+        """What a camera saw in a frame that arrived ``now`` [s, any monotonic clock]."""
+        bin_number = int(now // BIN_S)
         if not self._bins or self._bins[-1][0] < bin_number:
             self._bins.append((bin_number, set()))
             while self._bins[0][0] < bin_number - _WINDOW_S / BIN_S:

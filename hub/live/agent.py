@@ -155,12 +155,11 @@ class _HubAgent:
         return self._stack.enter_context(closing(self._bus.publisher(topic, self._agent, rate_hz=rate_hz)))
 
     def _handle(self, received: Received) -> None:
-        shard, arrival = self._shard, received.arrival_ns * 1e-9
-        if shard is not None and not shard.admits(received.topic.name, received.agent, received.message, arrival):
+        if self._shard is not None and not self._shard.admits(received.topic.name, received.agent, received.message):
             return
         if received.agent != self._agent or not isinstance(received.message, pb.Calibration):
             backlog = time.monotonic() < self._began + _BACKLOG_S
-            self._hub.handle(received.message, arrival, backlog=backlog)
+            self._hub.handle(received.message, received.arrival_ns * 1e-9, backlog=backlog)
 
     def _publish(self, messages: Iterable[Message]) -> None:
         shard = self._shard

@@ -13,6 +13,7 @@ from google.protobuf.message import Message
 
 from hub.distributed.merge import merge_calibrations
 from hub.distributed.sharding import OverlapMeter, Pairs, border, split
+from hub.live.budgets import MAX_CAMERAS
 from hub.live.live_hub import LiveHub, merge_rigs
 from hub.live.messages import calibration_from_message, calibration_message
 from hub.tracking.detections import tracked_kind
@@ -34,6 +35,7 @@ _BORDER_S = 10.0  # s: between two looks at who is across the border, and whethe
 _LEAVE_S = 30.0  # s: a camera that has gone for so long is in no group
 _DECAY = 0.98
 """Of an overlap, each second in which both cameras see something, but nothing together: of 30 s 1 s after 170 s."""
+_MAX_LABELS = 64  # of one frame that overlaps are measured by
 _STATES = ("refused", "collecting", "searching", "degraded", "calibrated")  # the worst first
 
 
@@ -96,14 +98,17 @@ class Shard:
                 del self._alive[agent]
             self._due = True
 
-    def admits(self, topic: str, agent: str, message: Message, arrival: float | None) -> bool:
+    def admits(self, topic: str, agent: str, message: Message) -> bool:
         """Take what is for sharing; whether a message is for the hub itself."""
         if isinstance(message, pb.Observation):
-            if arrival is not None:
-                labels = (one.kind if tracked_kind(one) else one.label for one in message.detections)
-                self._meter.observe(message.camera, labels, arrival)
+            # What had waited for a hub that starts has come all at once.
+            if message.camera in self._infos and self._now >= self._began + _LISTEN_S:
+                labels = {one.kind if tracked_kind(one) else one.label for one in message.detections[:_MAX_LABELS]}
+                self._meter.observe(message.camera, labels, self._now)
             return message.camera in self._mine
         if isinstance(message, pb.CameraInfo):
+            if message.camera not in self._infos and len(self._infos) >= MAX_CAMERAS:
+                return False
             self._infos[message.camera] = message
             self._met.setdefault(message.camera, self._now)
             return message.camera in self._mine
@@ -248,9 +253,12 @@ class Shard:
         try:
             rig = merge_rigs(observed, self._rig)
             site = merge_calibrations(calibrations, self.groups, rig, clocks, last, boots)
-            for hub in sorted(clocks, key=lambda hub: hub == self.name):
-                of_group = {n: boot for n, boot in clocks[hub].items() if n in self.groups.get(hub, ())}
-                boots = clocks[hub] | boots | of_group
+            of_parts = {name: boot for hub in sorted(clocks) for name, boot in clocks[hub].items()}
+            for hub, group in self.groups.items():
+                of_parts |= {name: clocks[hub][name] for name in group if name in clocks.get(hub, {})}
+            before = {} if last is None else last.cameras
+            kept = {name: boot for name, boot in boots.items() if site.cameras.get(name) is before.get(name)}
+            boots = of_parts | kept
             message = calibration_message(site, self._revision, boots)
         except Refused as refusal:
             message = pb.Calibration(schema_version=1, revision=self._revision, status="collecting")

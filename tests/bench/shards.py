@@ -251,7 +251,7 @@ class Site:
 
 def live(cameras: int, hubs: int, seconds: float, fps: float, seed: int) -> None:
     """Print what hubs over a router make of a street, and of the death of two of them."""
-    rig, observations, arrivals, true = street(seed, cameras, seconds + 120.0, fps, reach=5.0, stretch=4.0)
+    rig, observations, arrivals, true = street(seed, cameras, seconds + 300.0, fps, reach=4.0, stretch=4.0)
     names = [f"hub{number}" for number in range(hubs)]
     with ExitStack() as stack:
         site = Site(
