@@ -50,7 +50,7 @@ def merge_calibrations(
     Raises Refused where there is no part, and where no two cameras are in one world.
     """
     boots = boots or {}
-    order = _connected(parts, groups)
+    order = _connected(parts, set(last.cameras) if last else set())
     if not order:
         raise Refused("no hub has calibrated its cameras yet")
     chosen = [parts[hub] for hub in order]
@@ -66,14 +66,16 @@ def merge_calibrations(
             chosen[number].cameras[name], worlds[number], world_covariance[block[0], block[0]], clocks[number],
             clock_covariance[block[1], block[1]],
         )  # fmt: skip
-    first = chosen[0]
-    reference = last.reference if last is not None else first.reference
-    site = replace(
-        first, cameras=cameras, reference=reference, solver="hubs", trajectories=(), pairs=(), residuals={},
-        convergence=(), acceptance={}, cpu_seconds=sum(part.cpu_seconds for part in chosen),
-    )  # fmt: skip
     of_part = {name: boots.get(order[number], {}).get(name, "") for name, number in own.items()}
     same_clock = [name for name, boot in of_part.items() if boot == (last_boots or {}).get(name, "")]
+    if last is not None and (
+        len(own.keys() & last.cameras.keys()) < _LEAST_SHARED or not last.cameras.keys() & same_clock
+    ):
+        last = None  # nothing ties it to the parts any more
+    site = replace(
+        chosen[0], cameras=cameras, reference=(last or chosen[0]).reference, solver="hubs", trajectories=(), pairs=(),
+        residuals={}, convergence=(), acceptance={}, cpu_seconds=sum(part.cpu_seconds for part in chosen),
+    )  # fmt: skip
     site = _on_clock_of(_in_world(site, rig, last), last, same_clock)
     refused = {name: why for part in parts.values() for name, why in part.refused.items() if name not in site.cameras}
     refused |= {
@@ -85,9 +87,17 @@ def merge_calibrations(
     return replace(site, refused=refused)
 
 
-def _connected(parts: Mapping[str, Calibration], groups: Mapping[str, Sequence[str]]) -> list[str]:
-    """Hubs whose parts are in one world, the largest first, each after one that it shares most cameras with."""
-    left = sorted((hub for hub in parts if len(parts[hub].cameras) > 1), key=lambda h: (-len(parts[h].cameras), h))
+def _connected(parts: Mapping[str, Calibration], known: set[str]) -> list[str]:
+    """Hubs whose parts are in one world, the largest first, each after one that it shares most cameras with.
+
+    known: cameras of the calibration before, in whose world the first one should be.
+    """
+
+    def rank(hub: str) -> tuple[bool, int, str]:
+        cameras = set(parts[hub].cameras)
+        return len(cameras & known) < min(_LEAST_SHARED, len(known)), -len(cameras), hub
+
+    left = sorted((hub for hub in parts if len(parts[hub].cameras) > 1), key=rank)
     order, placed = left[:1], set(parts[left[0]].cameras) if left else set()
     while left := [hub for hub in left if hub not in order]:
         nearest = max(left, key=lambda hub: len(placed & set(parts[hub].cameras)))
@@ -217,10 +227,11 @@ def _in_world(site: Calibration, rig: Rig, last: Calibration | None) -> Calibrat
     world, kept = gauge.similarity, {}
     if last is not None:
         known = [name for name in site.cameras if name in last.cameras]
-        if gauge.scale == "arbitrary" and len(known) >= _LEAST_SHARED:
+        if gauge.scale == "arbitrary":
             one, other = (_markers([of.cameras[name].pose for name in known]).reshape(-1, 3) for of in (site, last))
             world = fit_robustly(one, other, np.ones(len(one)))
-        kept = {name: camera for name, camera in last.cameras.items() if name not in site.cameras}
+        if gauge.scale == last.scale:
+            kept = {name: camera for name, camera in last.cameras.items() if name not in site.cameras}
     cameras = {
         name: replace(
             camera,
@@ -248,7 +259,7 @@ def _on_clock_of(site: Calibration, last: Calibration | None, same_clock: Sequen
         moved = TimeMap(rate * old.clock_rate, rate * (old.time_offset - now.time_offset) + target.time_offset)
         is_kept = last is not None and camera is last.cameras.get(name)
         cameras[name] = camera if is_kept else replace(camera, time_map=moved)
-    return replace(site, cameras=cameras)
+    return replace(site, cameras=cameras, reference=base if last is None else site.reference)
 
 
 def _poses(part: Calibration) -> dict[str, Pose]:

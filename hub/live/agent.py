@@ -124,6 +124,8 @@ class _HubAgent:
         self.observations = self._subscriptions[1]
         if shard is not None:
             self._subscriptions[topics.index(TRACK)].ignore({agent})
+        self._prompt = [one for one, topic in zip(self._subscriptions, topics, strict=True) if topic in (SHARD, PART)]
+        """Read before all else: few messages, which must not wait behind their hubs' tracks."""
         self._publishers = {
             "Calibration": self._publisher(CALIBRATION),
             "Track": self._publisher(TRACK, rate_hz=200.0),
@@ -172,6 +174,8 @@ class _HubAgent:
             for one in (self._hub.nodes, self._shard):
                 if one is not None:
                     one.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
+        for received in (one for subscription in self._prompt for one in subscription.drain()):
+            self._handle(received)
         self._shares.take(one for subscription in self._subscriptions for one in subscription.drain())
         now = time.monotonic()
         if now >= self._began + _BACKLOG_S:

@@ -200,11 +200,14 @@ class LiveHub:
         for name in cameras:
             self.stream.release(name)
             self.links.last_frame.pop(name, None)
+        if self.calibration is not None:
+            kept = {name: one for name, one in self.calibration.cameras.items() if name not in cameras}
+            self.calibration = replace(self.calibration, cameras=kept) if len(kept) > 1 else None
 
-    def adopt(self, calibration: Calibration | None, boot_ids: Mapping[str, str]) -> None:
+    def adopt(self, calibration: Calibration, boot_ids: Mapping[str, str]) -> None:
         """Go on from another hub's answer, about other cameras than before. boot_ids: of the clocks of its maps."""
         self._superseded, self._answer_rows, self._reloaded, self.refusal = self._jobs, 0.0, None, None
-        self.calibration = calibration if calibration is not None and len(calibration.cameras) > 1 else None
+        self.calibration = calibration if len(calibration.cameras) > 1 else None
         self._solved_boot_ids = dict(boot_ids)
         self._clock_stepped = self.calibration is not None  # published with the next tick
 

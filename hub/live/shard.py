@@ -225,10 +225,10 @@ class Shard:
             self._hub.handle(self._infos[name])
         if self.site is not None:
             site, boots = self._read(self.site)
-            self._hub.adopt(replace(site, cameras={n: c for n, c in site.cameras.items() if n in mine}), boots)
+            known = {name: camera for name, camera in site.cameras.items() if name in mine}
+            if self._hub.calibration is None or len(known) > len(mine & self._hub.calibration.cameras.keys()):
+                self._hub.adopt(replace(site, cameras=known), boots)
             self._use_site(self.site)
-        elif self._hub.calibration is not None:
-            self._hub.adopt(None, {})  # about other cameras
 
     def _message(self) -> pb.Shard:
         message = pb.Shard(schema_version=1, hub=self.name, version=self.version)

@@ -132,6 +132,22 @@ def test_world_and_clock_are_held_and_what_no_part_has_is_kept() -> None:
     assert found.cameras[found.reference].time_map == TimeMap(1.0, 0.0)
 
 
+def test_a_larger_part_that_nothing_ties_to_the_site_does_not_take_its_place() -> None:
+    world = World(8)
+
+    def some(hub: str, numbers: range) -> Calibration:
+        names = [f"cam{number}" for number in numbers]
+        return replace(world.parts[hub], cameras={name: world.parts[hub].cameras[name] for name in names})
+
+    last = merge_calibrations({"a": some("a", range(5))}, GROUPS, world.rig)
+    found = merge_calibrations({"a": some("a", range(5)), "b": some("b", range(8, 16))}, GROUPS, world.rig, last=last)
+    assert set(found.cameras) == set(last.cameras)
+    assert world.position_errors(found).max() < 1e-8
+    anew = merge_calibrations({"b": some("b", range(8, 16))}, GROUPS, world.rig, last=last)
+    assert set(anew.cameras) == {f"cam{number}" for number in range(8, 16)}, "two worlds are not mixed"
+    assert anew.reference in anew.cameras
+
+
 def test_a_restarted_camera_does_not_hold_the_clock() -> None:
     world = World(4)
     last = merge_calibrations(world.parts, GROUPS, world.rig)
