@@ -33,8 +33,8 @@ _MEET_S = 8.0
 """How long a camera is heard before it goes to a hub: film in which its overlaps show."""
 _BORDER_S = 10.0  # s: between two looks at who is across the border, and whether the split is still a good one
 _LEAVE_S = 30.0  # s: a camera that has gone for so long is in no group
-_DECAY = 0.98
-"""Of an overlap, each second in which both cameras see something, but nothing together: of 30 s 1 s after 170 s."""
+_MEASURE_S, _DECAY = 2.0, 0.96
+"""Of an overlap, each time that both cameras see something, but nothing together: of 30 s 1 s is left after 170 s."""
 _MAX_LABELS = 64  # of one frame that overlaps are measured by
 _STATES = ("refused", "collecting", "searching", "degraded", "calibrated")  # the worst first
 
@@ -60,7 +60,8 @@ class Shard:
         self._parts: dict[str, pb.Calibration] = {}
         self._handover = TrackHandover(name)
         self._now, self._began = 0.0, float("inf")
-        self._next, self._next_border = 0.0, 0.0
+        self._next = self._next_border = self._next_measure = 0.0
+        self._overlaps[name] = {}
         self._due = self._is_new = False
         self._revision = 0
 
@@ -158,7 +159,9 @@ class Shard:
         if now < self._next and not self._due:
             return []
         self._next, self._due = now + _PERIOD_S, False
-        self._measure()
+        if now >= self._next_measure:
+            self._next_measure = now + _MEASURE_S
+            self._measure()
         before = self.version
         if self.leads:
             self._split()
@@ -172,7 +175,7 @@ class Shard:
 
     def _measure(self) -> None:
         """Renew the overlaps of the cameras that this hub hears."""
-        seen, known = self._meter.pairs(), self._overlaps.get(self.name, {})
+        seen, known = self._meter.pairs(), self._overlaps[self.name]
         heard = {name for pair in seen for name in pair}
         faded = {
             pair: seconds * (_DECAY if heard.issuperset(pair) and pair not in seen else 1.0)

@@ -84,15 +84,22 @@ def test_exact_parts_give_the_exact_site(seed: int) -> None:
 
 
 def test_noise_is_not_made_larger_and_stds_cover_it() -> None:
-    errors, lags = [], []
+    errors, lags, z = [], [], []
     for seed in range(20):
         world = World(seed, 0.01)
         found = merge_calibrations(world.parts, GROUPS, world.rig)
         errors.append(world.position_errors(found))
         stds = np.array([camera.time_offset_std for camera in found.cameras.values()])
+        names, near = list(found.cameras), world.parts["a"].cameras.keys()
+        true = np.array([world.poses[name].position for name in names])
+        here = np.array([found.cameras[name].pose.position for name in names])
+        is_near = np.array([name in near for name in names])
+        off = fit_similarity(true[is_near], here[is_near]).points(true) - here
+        z.append((off / [found.cameras[name].position_std for name in names])[~is_near])
         lags.append((world.lag_errors(found) / np.hypot(stds, stds[0]))[1:])
     assert np.sqrt(np.mean(np.square(errors))) < 1.3 * 0.01 * np.sqrt(3)
     assert np.sqrt(np.mean(np.square(lags))) < 1.5
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
 def test_the_answer_depends_on_no_order_of_hubs() -> None:
