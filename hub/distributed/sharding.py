@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from hub.distributed.partition import cut, partition
+from hub.sync.overlap import BIN_S, MOST_PARTNERS, common_seconds
 from hub.sync.settings import PairSettings
-from protocols.geometry.types import Ints
 
-MOST_PARTNERS = 12
-"""Of one camera, those with most overlap: the clock graph needs two, and a third to check them."""
-BIN_S = 0.5
-"""Length of a bin; priors by times of arrival are at most as far apart (``_MAX_PRIOR_WINDOW``), so neighbours count."""
 _WINDOW_S = 30.0  # of film that overlaps come from: what a calibration needs at least
 _MAX_EXCESS = 0.25
 """By how much a group may be larger than its share before all are split anew; a split itself leaves a twentieth."""
@@ -62,26 +57,6 @@ class OverlapMeter:
                 if value >= PairSettings().min_scan_support:
                     out[min(camera, other), max(camera, other)] = float(value)
         return out
-
-
-def common_seconds(camera: Ints, key: Ints, targets: int, cameras: int) -> Any:
-    """Sparse (cameras, cameras) seconds in which both saw one target, to within a bin.
-
-    camera, key: (n,) who saw, and bin times ``targets`` plus target.
-    """
-    from scipy.sparse import csr_array  # slow to import, and needed by large networks only
-
-    if not len(camera):
-        return csr_array((cameras, cameras))
-    # A bin and its neighbours, which are as many keys away as there are targets.
-    near = np.concatenate([key, key - targets, key + targets])
-    columns, column = np.unique(near, return_inverse=True)
-    shape = (cameras, len(columns))
-    exact = csr_array((np.ones(len(key)), (camera, column[: len(key)])), shape)
-    around = csr_array((np.ones(len(near)), (np.tile(camera, 3), column)), shape)
-    around.data[:] = 1.0  # several neighbours of one bin were added up
-    counts: Any = exact @ around.T
-    return csr_array(BIN_S * counts.maximum(counts.T))
 
 
 def split(pairs: Pairs, cameras: Iterable[str], hubs: Iterable[str], before: Groups) -> dict[str, list[str]]:

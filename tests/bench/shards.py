@@ -31,7 +31,8 @@ from deploy.offline.exchange.session_log import _observation_messages, camera_in
 from hub.calibration.pipeline import calibrate
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.distributed.merge import merge_calibrations
-from hub.distributed.sharding import BIN_S, OverlapMeter, border, split
+from hub.distributed.sharding import OverlapMeter, border, split
+from hub.sync.overlap import BIN_S
 from protocols.bus.base import Bus
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig

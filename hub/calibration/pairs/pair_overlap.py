@@ -14,7 +14,7 @@ import numpy as np
 
 from hub.bundle.preprocessing import PreparedSession
 from hub.clocks.external_prior import ExternalClockPrior
-from hub.distributed.sharding import BIN_S, MOST_PARTNERS, common_seconds
+from hub.sync.overlap import BIN_S, MOST_PARTNERS, common_seconds
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import smooth_only
 from protocols.geometry.types import Ints
