@@ -103,8 +103,8 @@ def offline(cameras: int, hubs: int, seconds: float, fps: float, seed: int) -> N
     merge_s = time.process_time() - began
     both = [name for name in merged.cameras if name in joint.cameras]
     one, other = (errors({n: c.pose for n, c in f.cameras.items()}, true, both) for f in (merged, joint))
-    first = both[0]
-    lag = [_lag(merged, name, first) - _lag(joint, name, first) for name in both]
+    first, at = both[0], {name: joint.cameras[name].lag_time for name in both}
+    lag = [_on_clock_of(merged, name, first, at[name]) - _on_clock_of(joint, name, first, at[name]) for name in both]
     print(
         f"| {cameras} | {hubs} | {seed} | {len(merged.cameras)} / {len(joint.cameras)} | {1e3 * rms(one):.2f} | "
         f"{1e3 * rms(other):.2f} | {rms(one) / rms(other):.3f} | {1e3 * rms(np.array(lag)):.3f} | "
@@ -112,11 +112,10 @@ def offline(cameras: int, hubs: int, seconds: float, fps: float, seed: int) -> N
     )  # fmt: skip
 
 
-def _lag(found: Calibration, name: str, first: str) -> float:
-    """Time on the first camera's clock [s] at a camera's lag time."""
-    camera, base = found.cameras[name], found.cameras[first].time_map
-    own = camera.time_map
-    return (own.clock_rate * camera.lag_time + own.time_offset - base.time_offset) / base.clock_rate
+def _on_clock_of(found: Calibration, name: str, first: str, at: float) -> float:
+    """A camera's time ``at`` [s] on the first camera's clock."""
+    own, base = found.cameras[name].time_map, found.cameras[first].time_map
+    return (own.clock_rate * at + own.time_offset - base.time_offset) / base.clock_rate
 
 
 class Site:
