@@ -61,6 +61,8 @@ CALIBRATION = Topic("calibration", "hub/{id}/calibration", "Calibration", 0.5, T
 TRACK = Topic("track", "hub/{id}/track", "Track", 30.0, True, Delivery.RELIABLE, 4096, 0.0)
 TRACK_SMOOTHED = Topic("track_smoothed", "hub/{id}/track_smoothed", "Track", 30.0, True, Delivery.RELIABLE, 4096, 0.0)
 SOLVER_EVENT = Topic("solver_event", "hub/{id}/solver", "SolverEvent", 1.0, True, Delivery.RELIABLE, 256, 0.0)
+PART = Topic("part", "hub/{id}/part", "Calibration", 0.5, False, Delivery.LATEST, 64, 0.0)
+SHARD = Topic("shard", "hub/{id}/shard", "Shard", 1.0, False, Delivery.LATEST, 64, 5.0)
 STATUS = Topic("status", "agent/{id}/status", "AgentStatus", 1.0, True, Delivery.LATEST, 1024, 5.0)
 NODE_STATE = Topic("node_state", "node/{id}/state", "NodeState", 10.0, True, Delivery.LATEST, 4096, 2.0)
 COMMAND = Topic("command", "view/{id}/command", "Command", 0.1, False, Delivery.RELIABLE, 64, 0.0)
@@ -76,7 +78,8 @@ ROAD_MAP = Topic("road_map", "uav/{id}/road", "RoadMap", 2.0, True, Delivery.LAT
 
 TOPICS: tuple[Topic, ...] = (
     OBSERVATION, CAMERA_INFO, RIG_INFO, CALIBRATION, TRACK, TRACK_SMOOTHED, SOLVER_EVENT, STATUS, NODE_STATE, COMMAND,
-    PICTURE, PREDICTION, FLIGHT_IMAGE, TELEMETRY, TARGET_COMMAND, TARGET, TARGET_CLOUD, ROAD_MAP, UAV_INFO,
+    PICTURE, PREDICTION, FLIGHT_IMAGE, TELEMETRY, TARGET_COMMAND, TARGET, TARGET_CLOUD, ROAD_MAP, UAV_INFO, PART,
+    SHARD,
 )  # fmt: skip
 TOPICS_BY_NAME: dict[str, Topic] = {topic.name: topic for topic in TOPICS}
 

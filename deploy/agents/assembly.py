@@ -119,6 +119,7 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
     from hub.distributed.network.host import NodeHost
     from hub.live.agent import run_hub
     from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
+    from hub.live.shard import Shard
     from hub.live.worker import WorkerSolver
     from protocols.session.calibration import read_calibration
 
@@ -136,6 +137,7 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
         refine_lenses=config.refine_lenses,
     )
     hub = LiveHub(settings, rig, None if known is not None else nodes, known, WorkerSolver())
+    shard = Shard(config.id, hub, rig) if config.sharded else None
     export = None if config.out is None else partial(_export, out=config.out)
     state = config.state or default_folder(config.out, config.site, config.id)
     store = AnswerStore(state, config.history, None if config.out is None else config.out / "calibration.toml")
@@ -149,7 +151,7 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
         hub.notice = f"answers cannot be kept: {store.problem}" if store.problem else ""
 
     try:
-        run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export, on_result=keep)
+        run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export, on_result=keep, shard=shard)
     finally:
         store.close()
     if config.out is not None:

@@ -244,7 +244,8 @@ class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     disappeared is removed. known: a calibration.toml whose poses, intrinsics and clocks are kept fixed; nothing is
     solved then. known = "last": the last answer of this hub, however old, is used until the rows give a new one, also
     where cameras were restarted since. track: whether people, vehicles and unlabelled markers are tracked.
-    refine_lenses: whether measured lenses may change, as `calibrate --refine-lenses`.
+    refine_lenses: whether measured lenses may change, as `calibrate --refine-lenses`. sharded: whether this hub shares
+    the site's cameras with all others that say so, by their overlap.
     """
 
     id: str = "hub"
@@ -261,6 +262,12 @@ class HubConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     known: KnownName | None = None
     track: bool = True
     refine_lenses: bool = False
+    sharded: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sharded and (not self.solve or self.known is not None):
+            raise ValueError("sharded hubs calibrate their groups themselves; remove solve = false and known")
 
 
 class ViewConfig(AgentConfig, frozen=True, kw_only=True, forbid_unknown_fields=False):

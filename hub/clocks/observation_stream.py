@@ -51,6 +51,12 @@ class ObservationStream:
         self.marker = SessionBuilder(self._window_s)
         self.people = PeopleTracklets(_PEOPLE_WINDOW_S if self._window_s is None else self._window_s)
 
+    def release(self, camera: str) -> None:
+        """Forget a camera; what is known of its clock is kept."""
+        self.marker.forget(camera)
+        self.people.forget(camera)
+        self._infos.pop(camera, None)
+
     def assign(
         self, message: pb.Observation, arrival: float | None, *, backlog: bool = False
     ) -> tuple[pb.Observation, ClockChange | None]:

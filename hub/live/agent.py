@@ -15,6 +15,8 @@ from google.protobuf.message import Message
 from hub.distributed.network.host import ROLE as NODES
 from hub.live.fair_share import FairShare
 from hub.live.live_hub import SILENT_S, LiveHub
+from hub.live.shard import ROLE as SHARDS
+from hub.live.shard import Shard
 from hub.live.shedding import Shedding
 from protocols.bus.base import Bus, Publisher, Received
 from protocols.bus.commands import CommandSubscription
@@ -26,8 +28,10 @@ from protocols.topics import (
     CAMERA_INFO,
     NODE_STATE,
     OBSERVATION,
+    PART,
     PREDICTION,
     RIG_INFO,
+    SHARD,
     SOLVER_EVENT,
     STATUS,
     TRACK,
@@ -65,15 +69,16 @@ def run_hub(
     boot_id: str | None = None,
     beat: Callable[[], None] = lambda: None,
     export: Callable[[LiveHub], str] | None = None,
+    shard: Shard | None = None,
 ) -> None:
     """Process messages, have them solved, and publish until ``stop`` is set; then once more with all data.
 
     on_result: called after every answer that was taken, a calibration or a refusal (to write files). beat: watchdog
     heartbeat, called after every round, so that a watchdog detects a hanging loop. export: writes the calibration on
-    request of a view; returns a status text.
+    request of a view; returns a status text. shard: this hub's share of a site that several hubs calibrate together.
     """
     with ExitStack() as stack:
-        running = _HubAgent(hub, bus, agent, boot_id or uuid.uuid4().hex, stack)
+        running = _HubAgent(hub, bus, agent, boot_id or uuid.uuid4().hex, stack, shard)
         finish_by: float | None = None
         results, memory_frozen = hub.results, False
         freeze_garbage_collector()
@@ -106,13 +111,21 @@ def run_hub(
 class _HubAgent:
     """The steps of a round, and what the hub has open on the bus; stack: closes it."""
 
-    def __init__(self, hub: LiveHub, bus: Bus, agent: str, boot: str, stack: ExitStack) -> None:
+    def __init__(
+        self, hub: LiveHub, bus: Bus, agent: str, boot: str, stack: ExitStack, shard: Shard | None = None
+    ) -> None:
+        self._shard = shard
         self._hub, self._bus, self._agent, self._boot, self._stack = hub, bus, agent, boot, stack
         stack.callback(hub.solver.close)
         node_topics = () if hub.nodes is None else (NODE_STATE, CALIBRATION)
-        topics = (CAMERA_INFO, OBSERVATION, STATUS, *node_topics)
+        shared = () if shard is None else (SHARD, PART, TRACK, *(() if node_topics else (CALIBRATION,)))
+        topics = (CAMERA_INFO, OBSERVATION, STATUS, *node_topics, *shared)
         self._subscriptions = [stack.enter_context(closing(bus.subscribe(topic))) for topic in topics]
         self.observations = self._subscriptions[1]
+        if shard is not None:
+            self._subscriptions[topics.index(TRACK)].ignore({agent})
+        self._prompt = [one for one, topic in zip(self._subscriptions, topics, strict=True) if topic in (SHARD, PART)]
+        """Read before all else: few messages, which must not wait behind their hubs' tracks."""
         self._publishers = {
             "Calibration": self._publisher(CALIBRATION),
             "Track": self._publisher(TRACK, rate_hz=200.0),
@@ -121,16 +134,21 @@ class _HubAgent:
             "RigInfo": self._publisher(RIG_INFO),
             "AgentStatus": self._publisher(STATUS),
         }
+        if shard is not None:
+            self._publishers |= {"part": self._publisher(PART), "shard": self._publisher(SHARD)}
+            self._publishers |= {"calibration": self._publishers["Calibration"], "track": self._publishers["Track"]}
         self._smoothed = self._publisher(TRACK_SMOOTHED)
         self._node_publishers: dict[str, Publisher] = {}
         self._orders = stack.enter_context(closing(CommandSubscription(bus, agent, boot, ("recalibrate", "export"))))
-        self._watch = None if hub.nodes is None else stack.enter_context(closing(bus.watch_agents()))
+        self._watch = None if hub.nodes is None and shard is None else stack.enter_context(closing(bus.watch_agents()))
         stack.enter_context(bus.announce(ROLE, agent, boot))
         if hub.nodes is not None:
             stack.enter_context(bus.announce(NODES, agent, boot))
+        if shard is not None:
+            stack.enter_context(bus.announce(SHARDS, agent, boot))
         self._shares = FairShare(self._handle, time.monotonic, _MESSAGES_S)
         self._shedding = Shedding()
-        self._began = time.monotonic()
+        self._began = self._now = time.monotonic()
         self._sequence, self._next_status, self._next_rig, self._next_progress = 0, 0.0, 0.0, 0.0
         self._last_action = ""
         self._publish(hub.tick(self._began))  # what comes now has not waited since the machine began
@@ -139,19 +157,25 @@ class _HubAgent:
         return self._stack.enter_context(closing(self._bus.publisher(topic, self._agent, rate_hz=rate_hz)))
 
     def _handle(self, received: Received) -> None:
+        if self._shard is not None and not self._shard.admits(received.topic.name, received.agent, received.message):
+            return
         if received.agent != self._agent or not isinstance(received.message, pb.Calibration):
             backlog = time.monotonic() < self._began + _BACKLOG_S
             self._hub.handle(received.message, received.arrival_ns * 1e-9, backlog=backlog)
 
     def _publish(self, messages: Iterable[Message]) -> None:
-        for message in messages:
-            self._publishers[message.DESCRIPTOR.name].put(message)
+        shard = self._shard
+        for topic, message in [("", one) for one in messages] if shard is None else shard.outgoing(messages):
+            self._publishers[topic or message.DESCRIPTOR.name].put(message)
 
     def receive(self) -> None:
         """Take what has arrived."""
-        if self._hub.nodes is not None and self._watch is not None:
-            for event in self._watch.drain():
-                self._hub.nodes.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
+        for event in () if self._watch is None else self._watch.drain():
+            for one in (self._hub.nodes, self._shard):
+                if one is not None:
+                    one.on_liveliness(event.role, event.agent, event.boot_id, alive=event.alive)
+        for received in (one for subscription in self._prompt for one in subscription.drain()):
+            self._handle(received)
         self._shares.take(one for subscription in self._subscriptions for one in subscription.drain())
         now = time.monotonic()
         if now >= self._began + _BACKLOG_S:
@@ -169,7 +193,7 @@ class _HubAgent:
 
     def estimate(self, now: float, *, final: bool) -> None:
         """Publish what nodes, calibration and tracking have to say."""
-        hub = self._hub
+        hub, self._now = self._hub, now
         if hub.nodes is not None:
             for state in hub.nodes.tick(time.monotonic()):
                 if state.camera not in self._node_publishers:
@@ -180,9 +204,15 @@ class _HubAgent:
             hub.tracking.predicts = not self._shedding.sheds_predictions
             hub.tracking.markers.smooths = not self._shedding.sheds_smoothed
         self._publish(hub.tick(now, final=final))
+        if self._shard is not None:
+            for topic, message in self._shard.tick(now):
+                self._publishers[topic].put(message)
+            self.observations.ignore(self._shard.ignored)
         if hub.tracking is not None:
             for track in hub.tracking.smoothed():
-                self._smoothed.put(track)
+                shown = track if self._shard is None else self._shard.own_track(track)
+                if shown is not None:
+                    self._smoothed.put(shown)
 
     def report(self, now: float, rig: Rig | None, *, last: bool) -> None:
         """Publish progress, the rig and the status, each when it is due."""
@@ -212,7 +242,8 @@ class _HubAgent:
         needs_advice = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
         behind = f"messages wait of {', '.join(shares.behind[:8])}" if shares.behind else ""
         advice = [one.text for one in hub.guidance.advice()] if needs_advice else []
-        texts = (shed, status.message, behind, *advice, self._last_action)
+        shared = "" if self._shard is None else self._shard.text()
+        texts = (shed, status.message, shared, behind, *advice, self._last_action)
         status.message = "; ".join(text for text in texts if text)[:_MAX_TEXT]
         return status
 

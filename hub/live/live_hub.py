@@ -7,7 +7,7 @@ No sockets, threads, files or wall clock: ``handle`` takes messages, ``tick(now)
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -113,6 +113,8 @@ class LiveHub:
         """What the agent around has to say of its own health."""
         self.finished = False
         """Whether the last job was handed over, or there is none."""
+        self.is_shard = False
+        """Whether this hub is one of several (`Shard`): tracks are in the world of all of them."""
         self.budgets = CameraBudgets()
         self._begin()
 
@@ -193,6 +195,22 @@ class LiveHub:
         self.guidance.reset()
         self._begin()
 
+    def release(self, cameras: Collection[str]) -> None:
+        """Forget cameras that another hub has now."""
+        for name in cameras:
+            self.stream.release(name)
+            self.links.last_frame.pop(name, None)
+        if self.calibration is not None:
+            kept = {name: one for name, one in self.calibration.cameras.items() if name not in cameras}
+            self.calibration = replace(self.calibration, cameras=kept) if len(kept) > 1 else None
+
+    def adopt(self, calibration: Calibration, boot_ids: Mapping[str, str]) -> None:
+        """Go on from another hub's answer, about other cameras than before. boot_ids: of the clocks of its maps."""
+        self._superseded, self._answer_rows, self._reloaded, self.refusal = self._jobs, 0.0, None, None
+        self.calibration = calibration if len(calibration.cameras) > 1 else None
+        self._solved_boot_ids = dict(boot_ids)
+        self._clock_stepped = self.calibration is not None  # published with the next tick
+
     def reload(
         self,
         calibration: Calibration,
@@ -264,7 +282,7 @@ class LiveHub:
             self.counters["tracking_faults"] += 1
             self.tracking = LiveTracking()
             if self.calibration is not None:
-                self._track_with(*self._tracked_with)
+                self.track_with(*self._tracked_with)
             self.links.notices["tracking"] = f"tracking began anew: {type(error).__name__}: {error}"[:200]
             return []
 
@@ -494,7 +512,7 @@ class LiveHub:
         self._reloaded = None
         self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
         self.session = job.rig, job.observations
-        if job.last is None and self.calibration is not None and self.tracking is not None:
+        if job.last is None and self.calibration is not None and self.tracking is not None and not self.is_shard:
             self.tracking = LiveTracking()  # in another world frame
         self._report_steps(found)
         self.calibration, self.calibrated_at = found, now
@@ -578,9 +596,9 @@ class LiveHub:
         rig = known.rig
         self.calibration = replace(stated_calibration(rig, known.cameras), solver="known", version=VERSION, refused={})
         self._rig = rig
-        self._track_with(self.calibration, rig, {})
+        self.track_with(self.calibration, rig, {})
 
-    def _track_with(self, calibration: Calibration, rig: Rig | None, boot_ids: dict[str, str]) -> None:
+    def track_with(self, calibration: Calibration, rig: Rig | None, boot_ids: dict[str, str]) -> None:
         """Pass a new calibration to tracking. With ``up`` in the rig, the world's z axis is up."""
         self._tracked_with = calibration, rig, boot_ids
         if self.tracking is not None:
@@ -600,8 +618,8 @@ class LiveHub:
         assert self.calibration is not None
         self._revision += 1
         present, boot_ids = self._in_present_segments(self.calibration)
-        if changed:
-            self._track_with(present, self._rig, boot_ids)
+        if changed and not self.is_shard:
+            self.track_with(present, self._rig, boot_ids)
         message = calibration_message(present, self._revision, boot_ids)
         message.progress.extend(self.progress())
         message.state = self.state(self._now)[0]

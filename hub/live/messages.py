@@ -7,9 +7,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from hub.live.solver import SolverAnswer, SolverJob
-from protocols.core.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.core.version import VERSION
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.calibration import Calibration, TrajectoryTable
+from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
 from protocols.validation.codec import MAX_PAYLOAD
 from protocols.validation.rules import MAX_TEXT
 
@@ -49,6 +52,31 @@ def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[
         )
     message.refused.extend(_refusals(calibration.refused))
     return message
+
+
+def calibration_from_message(message: pb.Calibration, infos: Mapping[str, pb.CameraInfo]) -> Calibration:
+    """The calibration in a message, of the cameras that have introduced themselves: with them are the image sizes."""
+    cameras = {}
+    for found in message.cameras:
+        info = infos.get(found.camera)
+        lens = None if info is None else Intrinsics.of_message(found, (info.width, info.height))
+        if lens is not None:
+            cameras[found.camera] = CameraCalibration(
+                name=found.camera,
+                intrinsics=lens,
+                pose=Pose.from_rodrigues(np.array(found.rotation), np.array(found.translation)),
+                time_map=TimeMap(found.clock_rate, found.time_offset),
+                time_offset_std=found.time_offset_std,
+                position_std=np.array(found.position_std) if found.position_std else np.zeros(3),
+                rms_px=found.rms_px,
+                lag_time=found.lag_time_s,
+                lag_std=found.time_offset_std,
+                clock_rate_std=found.clock_rate_std,
+            )
+    refused = {entry.camera: entry.reason for entry in message.refused}
+    return Calibration(
+        cameras, message.reference_camera, message.scale, message.units, message.solver, VERSION, refused
+    )
 
 
 def refusal_message(reason: str, cameras: dict[str, str], revision: int, status: str) -> pb.Calibration:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, Self
@@ -87,6 +87,9 @@ class Subscription(Protocol):
         received: valid messages. dropped: this queue was full. lost: never arrived, by the publisher's sequence
         numbers. skipped: the same for topics with Delivery.LATEST. rejected.<reason>: failed validation.
         """
+
+    def ignore(self, agents: Set[str]) -> None:
+        """Drop what these agents publish from now on before it is decoded, and of nobody else."""
 
     def refusals(self) -> list[Refusal]:
         """The messages rejected since the last call, a bounded number of them: the counters include all."""

@@ -686,3 +686,33 @@ class UavInfo(_message.Message):
     seed: int
     model: str
     def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., fps: _Optional[float] = ..., matrix: _Optional[_Iterable[float]] = ..., distortions: _Optional[_Iterable[float]] = ..., fisheye: _Optional[bool] = ..., body_from_camera: _Optional[_Iterable[float]] = ..., seed: _Optional[int] = ..., model: _Optional[str] = ...) -> None: ...
+
+class Shard(_message.Message):
+    __slots__ = ("schema_version", "hub", "version", "groups", "overlaps")
+    class Overlap(_message.Message):
+        __slots__ = ("camera_a", "camera_b", "seconds")
+        CAMERA_A_FIELD_NUMBER: _ClassVar[int]
+        CAMERA_B_FIELD_NUMBER: _ClassVar[int]
+        SECONDS_FIELD_NUMBER: _ClassVar[int]
+        camera_a: str
+        camera_b: str
+        seconds: float
+        def __init__(self, camera_a: _Optional[str] = ..., camera_b: _Optional[str] = ..., seconds: _Optional[float] = ...) -> None: ...
+    class Group(_message.Message):
+        __slots__ = ("hub", "cameras")
+        HUB_FIELD_NUMBER: _ClassVar[int]
+        CAMERAS_FIELD_NUMBER: _ClassVar[int]
+        hub: str
+        cameras: _containers.RepeatedScalarFieldContainer[str]
+        def __init__(self, hub: _Optional[str] = ..., cameras: _Optional[_Iterable[str]] = ...) -> None: ...
+    SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
+    HUB_FIELD_NUMBER: _ClassVar[int]
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    GROUPS_FIELD_NUMBER: _ClassVar[int]
+    OVERLAPS_FIELD_NUMBER: _ClassVar[int]
+    schema_version: int
+    hub: str
+    version: int
+    groups: _containers.RepeatedCompositeFieldContainer[Shard.Group]
+    overlaps: _containers.RepeatedCompositeFieldContainer[Shard.Overlap]
+    def __init__(self, schema_version: _Optional[int] = ..., hub: _Optional[str] = ..., version: _Optional[int] = ..., groups: _Optional[_Iterable[_Union[Shard.Group, _Mapping]]] = ..., overlaps: _Optional[_Iterable[_Union[Shard.Overlap, _Mapping]]] = ...) -> None: ...

@@ -154,6 +154,11 @@ class SessionBuilder:
             out.update(moving if len(moving) > 1 else ())
         return {camera: CHUNK_S * count for camera, count in out.items()}
 
+    def forget(self, camera: str) -> None:
+        """Forget a camera and its detections, as if it had never been heard of."""
+        for of_camera in (self._cameras, self._boots, self._labels_of):
+            of_camera.pop(camera, None)
+
     def forget_before(self, camera: str, time: float) -> None:
         """Do not use a camera's detections before a time on its clock [s]: it was moved then."""
         self._since[camera, self.boot(camera)] = round(time * NANOSECONDS)

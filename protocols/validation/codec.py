@@ -89,7 +89,7 @@ def sender(message: Message) -> str | None:
         return message.sender
     if isinstance(message, pb.AgentStatus | UAV_MESSAGES):
         return message.agent
-    return None
+    return message.hub if isinstance(message, pb.Shard) else None
 
 
 def encode(message: Message) -> bytes:

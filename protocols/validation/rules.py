@@ -37,6 +37,7 @@ SCHEMA_VERSION = 1  # of the messages
 
 MAX_DETECTIONS = 4096  # of one frame
 MAX_CAMERAS = 1024  # of a hub
+MAX_OVERLAPS = 12 * MAX_CAMERAS  # of each camera as many as a calibration takes pairs
 MAX_NUMBERS = 256  # of one list
 MAX_LABEL = 64  # characters
 MAX_TEXT = 4096  # characters
@@ -475,6 +476,22 @@ def _node_state(message: pb.NodeState) -> None:
     _distinct((anchor.camera for anchor in message.anchors), "anchor")
 
 
+def _shard(message: pb.Shard) -> None:
+    _name(message.hub, "hub")
+    _count(message.groups, "groups", MAX_CAMERAS)
+    cameras = [camera for group in message.groups for camera in group.cameras]
+    _count(cameras, "cameras", MAX_CAMERAS)
+    for name in (*(group.hub for group in message.groups), *cameras):
+        _name(name, "hub or camera")
+    _distinct((group.hub for group in message.groups), "hub")
+    _distinct(cameras, "camera")
+    _count(message.overlaps, "overlaps", MAX_OVERLAPS)
+    for overlap in message.overlaps:
+        _name(overlap.camera_a, "camera")
+        _name(overlap.camera_b, "camera")
+        _number(overlap.seconds, "seconds", 0.0, MAX_TIME_S)
+
+
 ACTIONS = frozenset({"start_recording", "stop_recording", "recalibrate", "export"})
 MAX_PICTURE = 512 * 1024  # bytes of a thumbnail
 
@@ -621,4 +638,5 @@ _RULES: dict[str, Callable[[Any], None]] = {
     "TargetCloud": _target_cloud,
     "RoadMap": _road_map,
     "UavInfo": _uav_info,
+    "Shard": _shard,
 }

@@ -19,19 +19,29 @@ _SPACING_M, _REACH_M, _STRETCH_M = 2.0, 12.0, 20.0
 
 
 def street(
-    seed: int, cameras: int, seconds: float, fps: float = 30.0, delay: float = 0.05
+    seed: int,
+    cameras: int,
+    seconds: float,
+    fps: float = 30.0,
+    delay: float = 0.05,
+    reach: float = _REACH_M,
+    stretch: float = _STRETCH_M,
 ) -> tuple[Rig, Observations, dict[str, ExternalClockPrior], dict[str, Pose]]:
-    """Rig, rows, priors by times of arrival (up to ``delay`` off) and true poses, a pure function of the arguments."""
+    """Rig, rows, priors by times of arrival (up to ``delay`` off) and true poses, a pure function of the arguments.
+
+    reach: how far along the street a camera sees; stretch: what a target is at home in [m]: where both are short, a
+    camera always sees some targets move, and a film of a few seconds is enough.
+    """
     rng = np.random.default_rng(seed)
     length = _SPACING_M * cameras
-    homes = np.arange(0.5 * _STRETCH_M, length + 0.5 * _STRETCH_M, 0.5 * _STRETCH_M)
+    homes = np.arange(0.5 * stretch, length + 0.5 * stretch, 0.5 * stretch)
     phases = rng.uniform(0, 2 * np.pi, (len(homes), 6))
     table, poses, clocks, arrivals = {}, {}, {}, {}
     rows: tuple[list[str], list[str], list[Floats], list[Floats], list[Floats]] = [], [], [], [], []
 
     def position(target: int, time: Floats) -> Floats:
         a, b, c, d, e, f = phases[target]
-        along = homes[target] + 0.5 * _STRETCH_M * np.sin(0.25 * time + a) + 1.5 * np.sin(1.3 * time + b)
+        along = homes[target] + 0.5 * stretch * np.sin(0.25 * time + a) + 1.5 * np.sin(1.3 * time + b)
         across = 2.0 * np.sin(0.9 * time + c) + 0.7 * np.sin(2.1 * time + d)
         return np.column_stack([along, across, 1.5 + 0.8 * np.sin(1.1 * time + e) + 0.4 * np.sin(2.7 * time + f)])
 
@@ -45,13 +55,13 @@ def street(
         own = epoch + rate * true
         clocks[name] = TimeMap(1.0 / rate, -epoch / rate)
         arrivals[name] = ExternalClockPrior("", -epoch + float(rng.uniform(0, delay)), 0.15)
-        for target in np.flatnonzero(np.abs(homes - place) < _REACH_M + 0.5 * _STRETCH_M):
+        for target in np.flatnonzero(np.abs(homes - place) < reach + 0.5 * stretch):
             points = position(int(target), true)
             lens = table[name].intrinsics
             assert lens is not None
             pixels = lens.project(poses[name].camera_from_world(points)) + rng.normal(0, 0.4, (len(true), 2))
             with np.errstate(invalid="ignore"):
-                inside = ((pixels >= 0) & (pixels < SIZE)).all(axis=1) & (np.abs(points[:, 0] - place) < _REACH_M)
+                inside = ((pixels >= 0) & (pixels < SIZE)).all(axis=1) & (np.abs(points[:, 0] - place) < reach)
             count = int(inside.sum())
             rows[0].extend([name] * count)
             rows[1].extend([f"target{target}"] * count)

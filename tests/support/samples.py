@@ -15,10 +15,12 @@ from protocols.topics import (
     FLIGHT_IMAGE,
     NODE_STATE,
     OBSERVATION,
+    PART,
     PICTURE,
     PREDICTION,
     RIG_INFO,
     ROAD_MAP,
+    SHARD,
     SOLVER_EVENT,
     STATUS,
     TARGET,
@@ -369,6 +371,15 @@ def solver_event() -> pb.SolverEvent:
     return message
 
 
+def shard(hub: str = "cam0") -> pb.Shard:
+    """A hub that follows two groups."""
+    message = pb.Shard(schema_version=1, hub=hub, version=2)
+    message.groups.add(hub=hub, cameras=["cam0", "cam1"])
+    message.groups.add(hub="hub-b", cameras=["cam2"])
+    message.overlaps.add(camera_a="cam1", camera_b="cam2", seconds=12.5)
+    return message
+
+
 SAMPLES: dict[Topic, Callable[[], Message]] = {
     OBSERVATION: observation,
     CAMERA_INFO: camera_info,
@@ -389,6 +400,8 @@ SAMPLES: dict[Topic, Callable[[], Message]] = {
     TARGET_CLOUD: target_cloud,
     ROAD_MAP: road_map,
     UAV_INFO: uav_info,
+    PART: calibration,
+    SHARD: shard,
 }
 
 

@@ -67,19 +67,24 @@ def similarity_to_published(
     count = sum(len(part) for part in sources)
     weights = [np.ones(count)]
     for name, pose in zip(common, poses, strict=True):
-        sources.append(_markers(pose, reach))
-        targets.append(_markers(published.cameras[name].pose, reach * ratio))
+        sources.append(camera_markers(pose, reach))
+        targets.append(camera_markers(published.cameras[name].pose, reach * ratio))
         weights.append(np.full(4, max(_CAMERA_WEIGHT * count, 1.0) / (4 * len(common))))
     source, target, weight = np.concatenate(sources), np.concatenate(targets), np.concatenate(weights)
+    return fit_robustly(source, target, weight), datum
+
+
+def fit_robustly(source: Floats, target: Floats, weight: Floats) -> Similarity:
+    """The similarity from points (n, 3) to others, by weights (n,), of which far outliers hardly count."""
     found = fit_similarity(source, target, weights=weight)
     for _ in range(3):
         distance = np.linalg.norm(found.points(source) - target, axis=1)
         limit = _OUTLIER * float(np.median(distance)) + 1e-12
         found = fit_similarity(source, target, weights=weight / np.maximum(1.0, distance / limit) ** 2)
-    return found, datum
+    return found
 
 
-def _markers(pose: Pose, reach: float) -> Floats:
+def camera_markers(pose: Pose, reach: float) -> Floats:
     """A camera's centre and a point on each of its axes (4, 3)."""
     return np.vstack([pose.position, pose.position + reach * pose.rotation])
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from hub.bundle.preprocessing import PreparedSession
 from hub.clocks.external_prior import ExternalClockPrior
+from hub.sync.overlap import BIN_S, MOST_PARTNERS, common_seconds
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import smooth_only
 from protocols.geometry.types import Ints
@@ -23,10 +24,6 @@ if TYPE_CHECKING:
 
 LARGE_NETWORK = 24
 """Cameras from which on pairs are chosen by overlap: up to there all of them take less than the adjustment."""
-_MOST_PARTNERS = 12
-"""Of one camera, those with most overlap: the clock graph needs two, and a third to check them."""
-_BIN_S = 0.5
-"""Length of a bin; priors by times of arrival are at most as far apart (``_MAX_PRIOR_WINDOW``), so neighbours count."""
 
 
 def candidate_pairs(
@@ -49,7 +46,7 @@ def candidate_pairs(
         after = (seconds.indices[row] - camera) % len(names)
         partners = zip(-seconds.data[row], after, seconds.indices[row], strict=True)
         enough = [other for less, _, other in sorted(partners) if other != camera and -less >= least]
-        chosen |= {(min(camera, other), max(camera, other)) for other in enough[:_MOST_PARTNERS]}
+        chosen |= {(min(camera, other), max(camera, other)) for other in enough[:MOST_PARTNERS]}
     unknown = [camera for camera, one in enumerate(known) if not one]
     chosen |= {(min(a, b), max(a, b)) for a in unknown for b in range(len(names)) if a != b}
     return [(names[a], names[b]) for a, b in sorted(chosen)]
@@ -57,8 +54,6 @@ def candidate_pairs(
 
 def _overlaps(prepared: PreparedSession, clocks: Mapping[str, ExternalClockPrior]) -> csr_array[Any]:
     """(cameras, cameras) seconds in which both saw one target, to within a bin."""
-    from scipy.sparse import csr_array  # slow to import, and needed by large networks only
-
     cameras, bins = list[Ints](), list[Ints]()
     targets = {label: index for index, label in enumerate(prepared.labels)}
     for number, name in enumerate(prepared.names):
@@ -66,18 +61,11 @@ def _overlaps(prepared: PreparedSession, clocks: Mapping[str, ExternalClockPrior
             continue
         offset = prepared.time_origins[name] + clocks[name].unix_minus_camera
         for label, track in smooth_only(prepared.camera(name).tracks).items():
-            seen = np.unique(np.floor((track.time + offset) / _BIN_S).astype(np.int64))
+            seen = np.unique(np.floor((track.time + offset) / BIN_S).astype(np.int64))
             bins.append(seen * len(targets) + targets[label])
             cameras.append(np.full(len(seen), number))
-    if not bins:
-        return csr_array(np.zeros((len(prepared.names),) * 2))
-    camera, key = np.concatenate(cameras), np.concatenate(bins)
-    # A bin and its neighbours, which are as many keys away as there are targets.
-    near = np.concatenate([key, key - len(targets), key + len(targets)])
-    columns, column = np.unique(near, return_inverse=True)
-    shape = (len(prepared.names), len(columns))
-    exact = csr_array((np.ones(len(key)), (camera, column[: len(key)])), shape)
-    around = csr_array((np.ones(len(near)), (np.tile(camera, 3), column)), shape)
-    around.data[:] = 1.0  # several neighbours of one bin were added up
-    counts: Any = exact @ around.T
-    return csr_array(_BIN_S * counts.maximum(counts.T))
+    nothing = [np.zeros(0, np.int64)]
+    seconds: csr_array[Any] = common_seconds(
+        np.concatenate(cameras or nothing), np.concatenate(bins or nothing), len(targets), len(prepared.names)
+    )
+    return seconds

@@ -102,6 +102,10 @@ class PeopleTracklets:
             while tracklet.rows and tracklet.rows[0].time_ns < now - self._window_ns:
                 tracklet.rows.popleft()
 
+    def forget(self, camera: str) -> None:
+        """Forget a camera's tracklets."""
+        self._cameras.pop(camera, None)
+
     def seconds(self, camera: str) -> float:
         """Total duration of the present tracklets of a camera [s]."""
         held = self._cameras.get(camera)

@@ -25,7 +25,7 @@ _PUBLISH_KEYS: Mapping[str, tuple[str, ...]] = {
     "camera": ("camera/{id}/**",),
     "uav": ("uav/{id}/**", "camera/{id}/**"),
     # Pose nodes of any camera may run on any hub.
-    "hub": ("hub/{id}/**", "node/**", "alive/nodes/{id}/*"),
+    "hub": ("hub/{id}/**", "node/**", "alive/nodes/{id}/*", "alive/shard/{id}/*"),
     "record": (),
     "view": ("view/{id}/**",),
     "router": ("canary/**",),

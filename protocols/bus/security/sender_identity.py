@@ -12,7 +12,7 @@ it. Without certificates the router does not prevent this, so every receiver enf
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
@@ -142,6 +142,10 @@ class SenderCheckedSubscription:
         counts.update(self._refused)
         counts["received"] -= sum(self._refused.values())
         return counts
+
+    def ignore(self, agents: Set[str]) -> None:
+        """Drop what these agents send."""
+        self._inner.ignore(agents)
 
     def refusals(self) -> list[Refusal]:
         """Always empty: rejections are passed on to the bus."""

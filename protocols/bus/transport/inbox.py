@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from itertools import chain
 from typing import TypeAlias
 
@@ -61,6 +61,7 @@ class Inbox:
         self._bulky = topic.bulky
         self._newest: dict[tuple[str, str], int] = {}
         self._refusals: list[Refusal] = []
+        self._ignored: Set[str] = frozenset()
         self._ready = threading.Condition()  # its lock is re-entrant
         self._counts: Counter[str] = Counter(received=0, dropped=0, lost=0)
 
@@ -81,12 +82,21 @@ class Inbox:
                 one = arrived.popleft()
                 groups[one[0]].append((order, *one))
             for key, queued in groups.items():
-                self._queue(key, queued)
+                if not self._is_ignored(key):
+                    self._queue(key, queued)
             while self._length > self._capacity or self._bytes > self._most:
                 by_count = self._length > self._capacity
                 self._drop(max(self._queues, key=lambda one: len(self._queues[one]) if by_count else self._sizes[one]))
             if was_empty and self._length:  # nobody waits while there is more
                 self._ready.notify_all()
+
+    def ignore(self, agents: Set[str]) -> None:
+        """Queue nothing that these agents send."""
+        self._ignored = agents
+
+    def _is_ignored(self, key: str) -> bool:
+        address = parse_key(key) if self._ignored else None
+        return address is not None and address.agent in self._ignored
 
     def _queue(self, key: str, queued: list[_Queued]) -> None:
         sizes = [len(one[2]) for one in queued]
@@ -253,6 +263,10 @@ class InboxSubscription:
     def counters(self) -> Mapping[str, int]:
         """See the contract."""
         return self.inbox.counters
+
+    def ignore(self, agents: Set[str]) -> None:
+        """Drop what these agents send."""
+        self.inbox.ignore(agents)
 
     def refusals(self) -> list[Refusal]:
         """The messages rejected since the last call."""
