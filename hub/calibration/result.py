@@ -118,11 +118,28 @@ def assemble_calibration(
     maps[reference] = TimeMap(1.0, 0.0)
     middles = cov.middles_of_overlap(problem, state)
     lag_times = [float(camera.camera_time(middles[i, [reference]])[0]) for i, camera in enumerate(state.cameras)]
+    middle_times = list(lag_times)
     for one in state.wanders:
         lag_times[one.camera] = one.instant
+        if one.camera == reference:  # the time of its even clock, and with it every map, holds there
+            at = state.cameras[reference].reference_time(np.array([one.instant]))
+            others = {other.camera for other in state.wanders}
+            lag_times = [
+                time if i in others else float(camera.camera_time(at)[0])
+                for i, (camera, time) in enumerate(zip(state.cameras, lag_times, strict=True))
+            ]
+    rate_stds = [
+        cov.clock_rate_std(covariance, state, i, reference) if problem.free_parameters.clock else 0.0
+        for i in range(len(names))
+    ]
     # Of the maps onto the reference camera's clock, in the middle of their common span.
     lag_stds = [
-        _with_correction_errors(std / base.rate, problem, state, i, reference)
+        float(
+            np.hypot(
+                _with_correction_errors(std / base.rate, problem, state, i, reference),
+                rate_stds[i] * (lag_times[i] - middle_times[i]),
+            )
+        )
         if problem.free_parameters.clock and i != reference
         else 0.0
         for i, std in enumerate(cov.relative_clock_stds(covariance, problem, state)[reference].tolist())
@@ -145,13 +162,8 @@ def assemble_calibration(
             lag_time=float(lag_times[i]) / time_scales[i] + time_origins[i],
             lag_std=lag_stds[i] / time_scales[reference],
             clock_rate_std=float(
-                np.hypot(
-                    cov.clock_rate_std(covariance, state, i, reference),
-                    np.linalg.norm([one.rate_std for one in state.wanders if one.camera in (i, reference)]),
-                )
-            )
-            if problem.free_parameters.clock
-            else 0.0,
+                np.linalg.norm([rate_stds[i], *(one.rate_std for one in state.wanders if one.camera in (i, reference))])
+            ),
             sensitivities=effects[i],
             clock_steps=tuple(
                 (step.time / time_scales[i] + time_origins[i], step.size / time_scales[i], step.std / time_scales[i])

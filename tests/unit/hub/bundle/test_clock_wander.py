@@ -11,7 +11,10 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from hub.bundle.noise.clock_wander import fit_wander
+from hub.calibration.incremental import update_calibration
 from hub.calibration.pipeline import calibrate
+from protocols.core.clocks import CameraTime
+from protocols.geometry.types import Floats
 from tests.bench import clock_models
 from tests.support import rigs
 
@@ -62,3 +65,25 @@ def test_errors_that_last_are_no_wander() -> None:
         pixels[mine] += lfilter([1.0], [1.0, -0.97], white, axis=0)
     found = calibrate(session.rig, replace(session, pixels=pixels).observations())
     assert not [text for text in found.warnings if "rate changes" in text]
+
+
+@pytest.mark.parametrize("slewed", ["cam0", "cam2"])
+def test_a_clock_that_is_slewed_live_is_followed_also_as_the_reference(slewed: str) -> None:
+    session = rigs.simulate(60, 5, 45.0)
+    mine = np.array([name == slewed for name in session.camera])
+
+    def added(true: Floats) -> Floats:
+        """What the service has added to the clock at true times."""
+        return np.asarray(5e-4 * (np.maximum(true - 15.0, 0.0) - np.maximum(true - 35.0, 0.0)))
+
+    times = session.time.copy()
+    times[mine] += added(np.array([session.true_time(slewed, time) for time in session.time[mine]]))
+    found = update_calibration(session.rig, replace(session, time=times).observations(), None).calibration
+    assert [text for text in found.warnings if text.startswith(f"{slewed}: its clock's rate changes")]
+    for name, camera in found.cameras.items():
+        at = camera.lag_time - (added(np.array([40.0]))[0] if name == slewed else 0.0)
+        true = session.true_time(name, at)
+        assert true > 40.0 or name != slewed
+        shown = session.shown("cam0", true) + (added(np.array([true]))[0] if slewed == "cam0" else 0.0)
+        error = float(camera.time_map.reference_from_camera(CameraTime(camera.lag_time))) - shown
+        assert abs(error) < 4.0 * camera.lag_std + 1e-6
