@@ -117,17 +117,12 @@ def assemble_calibration(
         maps.append(TimeMap(rate, time_at_centre - rate * (camera.centre / time_scale + time_origin)))
     maps[reference] = TimeMap(1.0, 0.0)
     middles = cov.middles_of_overlap(problem, state)
-    lag_times = [float(camera.camera_time(middles[i, [reference]])[0]) for i, camera in enumerate(state.cameras)]
-    middle_times = list(lag_times)
-    for one in state.wanders:
-        lag_times[one.camera] = one.instant
-        if one.camera == reference:  # the time of its even clock, and with it every map, holds there
-            at = state.cameras[reference].reference_time(np.array([one.instant]))
-            others = {other.camera for other in state.wanders}
-            lag_times = [
-                time if i in others else float(camera.camera_time(at)[0])
-                for i, (camera, time) in enumerate(zip(state.cameras, lag_times, strict=True))
-            ]
+    middle_times = [float(camera.camera_time(middles[i, [reference]])[0]) for i, camera in enumerate(state.cameras)]
+    instants = {one.camera: one.instant for one in state.wanders}
+    if reference in instants:  # its even clock, and with it every map, holds there
+        there = state.cameras[reference].reference_time(np.array([instants[reference]]))
+        instants = {i: float(camera.camera_time(there)[0]) for i, camera in enumerate(state.cameras)} | instants
+    lag_times = [instants.get(i, middle) for i, middle in enumerate(middle_times)]
     rate_stds = [
         cov.clock_rate_std(covariance, state, i, reference) if problem.free_parameters.clock else 0.0
         for i in range(len(names))

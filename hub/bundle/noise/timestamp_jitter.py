@@ -114,8 +114,8 @@ def _wanders(
 
     further: whether one of the others may: not while the path still follows a known one. instants: (cameras,) internal
     times at which the even clocks agree with them; None = that of the last frames. The likelihood ratio has to be more
-    than chance, and than all that lasting errors gain as much across the motion, where no clock shows: on two recorded
-    rigs, whose lenses are 2 % off, it is at most 0.8 of that, on twelve with errors that last for a second 0.9 of it.
+    than chance, and than all that correlated errors gain across the motion, where no clock shows: on two recorded
+    rigs, whose lenses are 2 % off, it is at most 0.8 of that, on twelve with errors correlated over a second 0.9.
     """
     found, across = dict[int, Wander](), 0.0
     for camera, frames in enumerate(parts):

@@ -56,7 +56,7 @@ def test_a_clock_that_a_service_slews_is_told_and_every_lag_holds(seed: int) -> 
         assert abs(said.lag_z) < 4.0
 
 
-def test_errors_that_last_are_no_wander() -> None:
+def test_correlated_errors_are_no_wander() -> None:
     session = rigs.simulate(41, 5, 40.0)
     random, pixels = np.random.default_rng(41), session.pixels.copy()
     for name in session.rig.cameras:
