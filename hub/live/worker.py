@@ -44,7 +44,12 @@ class WorkerSolver:
 
     def submit(self, job: SolverJob, now: float) -> None:
         """Hand a job over; a worker is started where none runs."""
-        self._job = job.number, now, self._started().submit(run_job, job)
+        try:
+            future = self._started().submit(run_job, job)
+        except BrokenProcessPool:  # it died after its last job
+            self._end()
+            future = self._started().submit(run_job, job)
+        self._job = job.number, now, future
         self._share = max(1.0, len(job.rig.cameras) / _CAMERAS)
         self._looked, self._spent_s = now, self._cpu_s()
         self._spent_before_s = self._spent_s

@@ -109,6 +109,19 @@ def test_a_solver_that_hangs_or_dies_is_replaced(
     assert solver.restarts == 1
 
 
+def test_a_worker_that_was_killed_between_jobs_is_replaced(solver: WorkerSolver, job: SolverJob) -> None:
+    solver.submit(job, time.monotonic())
+    assert answer_of(solver).calibration is not None
+    assert solver._pool is not None
+    [process] = solver._pool._processes.values()
+    process.kill()
+    process.join()
+    time.sleep(0.5)  # the pool's own thread notices
+    solver.submit(job, time.monotonic())
+    assert answer_of(solver).calibration is not None
+    assert solver.restarts == 1
+
+
 def test_a_solver_on_a_busy_machine_has_time_to_answer(
     solver: WorkerSolver, job: SolverJob, monkeypatch: pytest.MonkeyPatch
 ) -> None:
