@@ -12,7 +12,7 @@ and +35 ms.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.special import chdtri
@@ -264,7 +264,18 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     """
     if not problem.free_parameters.clock:
         return None
-    rejected = _step_of_rejected_rows(problem, state)
+    best = max(likely_clock_steps(problem, state) or (), key=lambda one: one.statistic, default=None)
+    if best is None or best.statistic <= needed_for_a_step(problem) or abs(best.size) <= _MIN_STEP_S:
+        return _step_of_rejected_rows(problem, state)
+    return best
+
+
+@lru_cache(maxsize=1)  # what the last search found is asked for once more
+def likely_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[ClockStep, ...] | None:
+    """Steps in their own noise, of the cameras that seem to step; None where errors do not last, as a step's would.
+
+    With free rates, those of a small step in much noise do not.
+    """
     # What the path absorbs of a camera's noise would make its noise alone a step: in four 15 s worlds of 6 to 15 fps.
     floor = float(np.median(state.sigma)) * _MIN_SIGMA_SHARE
     state = replace(state, sigma=np.maximum(state.sigma, floor))
@@ -272,7 +283,7 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     inflation = correlation_inflation(problem, state)
     scores = (score_inflation(problem, state, camera) for camera in range(len(state.cameras)))
     if inflation.max() < MIN_INFLATION and max(scores) < MIN_INFLATION and not _last_in_few_rows(problem, state):
-        return rejected  # no errors last, as a step's would
+        return None
     # A camera that steps has the most correlated residuals of all, for that reason: here it must not count for less.
     linear, trials = _Linearised.of(problem, state, state.sigma * np.sqrt(np.median(inflation))), []
     needed = needed_for_a_step(problem)
@@ -287,13 +298,11 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
             near = np.clip(near, _MIN_STEP_FRAMES, len(times) - _MIN_STEP_FRAMES)
             trials.append((trial, times[near.astype(int)]))
     trials = sorted(trials, key=lambda one: -one[0].statistic)[:_STEP_CAMERAS]
-    found = [
+    return tuple(
         _with_its_noise(problem, state, linear, trial.camera, near)
         for trial, near in trials
         if trial.statistic > _TRIED_SHARE * needed
-    ]
-    best = max(found, key=lambda one: one.statistic, default=None)
-    return rejected if best is None or best.statistic <= needed or abs(best.size) <= _MIN_STEP_S else best
+    )
 
 
 def _step_of_rejected_rows(problem: Problem, state: AdjustmentState) -> ClockStep | None:
@@ -506,7 +515,10 @@ class _Linearised:
             trial = apply_step(problem, state, still, step)
             there = weigh_residuals(problem, trial, self.prior, robust=False)
             if there.cost < residuals.cost:
+                gained = residuals.cost - there.cost
                 state, residuals, system, damping = trial, there, None, 0.1 * damping
+                if gained < _TOLERANCE * residuals.cost:
+                    break
             else:
                 damping *= 10.0
         return first - residuals.cost

@@ -67,6 +67,9 @@ def _steps_or_rates(
     problem, state = even
     if all(model_comparison.with_crystal_rates(*found).crystal_rates):
         return found
+    # Free rates and steps explain no less than steps alone: where none seems to add to them, none replaces them.
+    if model_comparison.likely_clock_steps(*found) == ():
+        return found
     rate = float(np.median([camera.rate for camera in state.cameras]))
     alike = tuple(replace(camera, rate=rate) for camera in state.cameras)
     held = replace(problem, crystal_rates=(True,) * len(alike))
