@@ -28,7 +28,6 @@ from hub.bundle.problem import (
 from hub.bundle.residuals import linearise, predict, residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior
 from hub.trajectory.discrete import PointBasis
-from hub.trajectory.splines import SUPPORT
 from protocols.geometry.types import Floats
 
 _MAX_ROWS = 2000
@@ -151,24 +150,23 @@ def _hat_matrix_trace(
     use = np.zeros_like(rows.use)
     use[pick] = True
     rows = rows.using(use)
-    line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label], CAMERA_PARAMETERS)
+    columns = CAMERA_PARAMETERS if len(found.columns) else 0
+    line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label], columns)
     root = (np.where(line.valid, 1.0 / rows.used_relative_std, 0.0) / float(state.sigma[rows.camera]))[:, None, None]
-    by_point, by_camera = root * line.point_jacobian, root * line.camera_jacobian
-    rows_of_label, columns, by_cameras = found.a_inv_b.parts[rows.label]
+    rows_of_label, seeing, by_cameras = found.a_inv_b.parts[rows.label]
     first = rows_of_label.start + 3 * line.index
     inside = (first % BAND)[:, None] + np.arange(BAND)
     blocks = found.blocks[(first // BAND)[:, None, None], inside[:, :, None], inside[:, None, :]]
-    w, n = line.weights, len(line.index)
-    point = np.einsum("na,naibj,nb->nij", w, blocks.reshape(n, SUPPORT, 3, SUPPORT, 3), w, optimize=True)
-    trace = float(np.einsum("npi,nij,npj->", by_point, point, by_point, optimize=True))
-    if len(found.columns):
-        sensitivity = by_cameras[3 * line.index[:, None] + np.arange(BAND)].reshape(n, SUPPORT, 3, len(columns))
-        shift = -by_point @ np.einsum("na,naip->nip", w, sensitivity)
-        parameters = problem.free_columns()[columns]
+    # By the four control points of a row, (n, 2, 12).
+    by_path = (line.weights[:, None, :, None] * (root * line.point_jacobian)[:, :, None, :]).reshape(-1, 2, BAND)
+    trace = float((by_path @ blocks * by_path).sum())
+    if columns:
+        shift = -by_path @ by_cameras[3 * line.index[:, None] + np.arange(BAND)]
+        parameters = problem.free_columns()[seeing]
         own = np.flatnonzero(parameters // CAMERA_PARAMETERS == rows.camera)
-        shift[:, :, own] += by_camera[:, :, parameters[own] % CAMERA_PARAMETERS]
-        free = found.free.submatrix(columns)
-        trace += float(np.einsum("npi,ij,npj->", shift, free, shift, optimize=True))
+        shift[:, :, own] += root * line.camera_jacobian[:, :, parameters[own] % CAMERA_PARAMETERS]
+        shift = shift.reshape(-1, len(seeing))
+        trace += float((shift @ found.free.submatrix(seeing) * shift).sum())
     return trace * len(used) / len(pick)
 
 
