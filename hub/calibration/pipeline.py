@@ -490,6 +490,9 @@ def _no_pair_reason(prepared: PreparedSession, pairs: list[PairSolution], refuse
             if listed
             else "one camera only: a pair is needed"
         )
+    if any(pair.solved for pair in pairs):
+        listed = "; ".join(f"{name}: {reason}" for name, reason in in_rig_order(refused, prepared).items())
+        return f"no two cameras are left whose views fit together ({listed})"
     listed = "; ".join(f"{pair.a}–{pair.b}: {pair.status}" for pair in pairs[:6])
     return f"no pair of cameras could be synchronised ({listed})"
 

@@ -15,6 +15,7 @@ class TrackerParameters:
 
     up: (3,) unit vector in world coordinates, None = unknown. scale: of the world. coast_s: how long a target is kept
     without detections. remember_s: how long a lost track may be re-identified; at most ``max_lost_tracks`` are kept.
+    lifetime_s: mean time that a target stays, where nothing is seen of it: a walker's way through a hall of 20 m.
     """
 
     up: Floats | None = None
@@ -22,6 +23,7 @@ class TrackerParameters:
     coast_s: float = 2.5
     remember_s: float = 120.0
     max_lost_tracks: int = 200
+    lifetime_s: float = 15.0
 
 
 def track_label(kind: int, number: int) -> str:

@@ -17,6 +17,7 @@ from protocols.session.rig import Rig, misspelt_keys, read_rig
 
 RIG_FILE = "rig.toml"
 OBSERVATIONS_FILE = "observations.csv"
+_MANY_TIMES = 10  # distinct ones that are all whole by chance: of stamps in tenths of a second one set in 10^10
 _MAX_OUTSIDE_SHARE = 0.01  # share of rows outside the image above which a warning is given
 
 
@@ -34,11 +35,12 @@ def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Ob
         )
     rig = read_rig(folder / RIG_FILE)
     found = read_observations(observations or folder / OBSERVATIONS_FILE, rig.cameras)
-    return rig, replace(found, warnings=found.warnings + out_of_image_warnings(rig, found) + misspelt_keys(rig))
+    return rig, replace(found, warnings=found.warnings + doubtful_columns(rig, found) + misspelt_keys(rig))
 
 
-def out_of_image_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
-    """Warnings for cameras with many rows outside their image: a wrong size, or u and v swapped."""
+def doubtful_columns(rig: Rig, observations: Observations) -> tuple[str, ...]:
+    """Warnings for cameras with many rows outside their image (a wrong size, or u and v swapped), or with times that
+    are frame numbers or milliseconds."""
     warnings = []
     for name, camera in rig.cameras.items():
         pixels = np.concatenate([np.zeros((0, 2)), *(track.pixels for track in observations.of_camera(name))])
@@ -47,6 +49,12 @@ def out_of_image_warnings(rig: Rig, observations: Observations) -> tuple[str, ..
             width, height = camera.size
             warnings.append(
                 f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image; check size, u, v"
+            )
+        times = np.concatenate([np.zeros(0), *(track.time for track in observations.of_camera(name))])
+        if camera.fps > 1.0 and len(np.unique(times)) >= _MANY_TIMES and (times == np.rint(times)).all():
+            warnings.append(
+                f"{name}: all its times are whole numbers of seconds, though it films {camera.fps:g} frames a second; "
+                "frame numbers have to be divided by the frame rate, milliseconds by 1000"
             )
     return tuple(warnings)
 

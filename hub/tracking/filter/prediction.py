@@ -14,8 +14,6 @@ from hub.tracking.filter.target_states import Targets
 from hub.tracking.parameters import TrackerParameters
 from protocols.geometry.types import Floats
 
-_LIFETIME_S = 60.0
-"""Mean time that a target stays, where nothing is seen of it."""
 _LOG_SIZE_PSD = 1e-4
 _WALKING_M_S, _STANDING_SHARE = 0.4, 0.05
 """Turning and swaying grow with speed: somebody who stands has this share of a walker's acceleration (variance)."""
@@ -37,5 +35,5 @@ def predict_targets(targets: Targets, elapsed: Floats | float, parameters: Track
     mean, covariance = kalman.predict(
         targets.mean, targets.covariance, elapsed, acceleration_psd, _LOG_SIZE_PSD, velocity_psd
     )
-    existence = targets.existence * np.exp(-np.maximum(elapsed, 0.0) / _LIFETIME_S)
+    existence = targets.existence * np.exp(-np.maximum(elapsed, 0.0) / parameters.lifetime_s)
     return replace(targets, mean=mean, covariance=covariance, existence=existence)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hub.bundle import initialisation
 from hub.calibration import acceptance as calibrating
-from hub.calibration.pipeline import calibrate
+from hub.calibration.pipeline import _no_pair_reason, calibrate
 from hub.calibration.triangulation import triangulate
 from hub.sync.pair_solver import _PairSearch, solve_pair
 from hub.sync.settings import PairSettings
@@ -233,3 +235,10 @@ def test_every_kind_of_refusal_has_a_scenario() -> None:
     assert not [
         reason for reason in REFUSAL_KINDS if not any(reason in kind for kind in (*KINDS, *REJECTED, TWO_ALIKE))
     ]
+
+
+def test_where_pairs_were_solved_their_cameras_reasons_are_given() -> None:
+    prepared: Any = SimpleNamespace(camera_order=("cam0", "cam1"), uncalibrated=())
+    pairs: list[Any] = [SimpleNamespace(a="cam0", b="cam1", solved=True, status="ok")]
+    reason = _no_pair_reason(prepared, pairs, {"cam1": "8 % of its rows fit"})
+    assert reason == "no two cameras are left whose views fit together (cam1: 8 % of its rows fit)"

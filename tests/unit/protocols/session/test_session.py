@@ -73,3 +73,12 @@ def test_too_little_is_refused_and_a_session_has_its_own_observations() -> None:
         calibrate(session)
     with pytest.raises(InputError, match="its own observations"):
         triangulate(session, "no.toml", observations="other.csv")
+
+
+def test_times_that_are_frame_numbers_are_named() -> None:
+    names, frames = ["CVLab1"] * 12 + ["CVLab2"] * 12, np.tile(np.arange(12), 2)
+    times = np.r_[np.arange(12.0), np.arange(12) / 25.0]
+    table = {"camera": names, "frame": frames, "time": times, "u": np.full(24, 9.0), "v": np.full(24, 9.0)}
+    rig = {name: {"size": [640, 480], "fps": 25.0} for name in ("CVLab1", "CVLab2")}
+    [warning] = Session.from_table(rig, table).warnings
+    assert warning.startswith("CVLab1: all its times are whole numbers")
