@@ -55,9 +55,9 @@ _STEP_TIMES, _MIN_STEP_FRAMES = 24, 30
 """Times at which a clock step is tried, and frames on each side of one: as many as a camera of a network needs."""
 _MIN_STEP_S = 5e-3
 """Smallest clock step [s] that is reported: less is jitter or a wandering clock."""
-_MAX_STEP_S = 0.2
+MAX_STEP_S = 0.2
 """Largest clock step [s] that is looked for among rejected rows: larger ones show in the stamps."""
-STEP_SIZES = np.linspace(-_MAX_STEP_S, _MAX_STEP_S, 81)
+STEP_SIZES = np.linspace(-MAX_STEP_S, MAX_STEP_S, 81)
 """Sizes [s] of a step that are tried where it is not linear: refined by the adjustment."""
 _REJECTED_SIGMA, _REJECTED_PX, _MIN_EXPLAINED = 5.0, 20.0, 0.5
 """Residual, in sigma and px, from which a row counts as not explained; share of the cost that a step has to remove."""
@@ -408,7 +408,7 @@ def _with_its_noise(
 
 
 def _with_rows_of_a_step(problem: Problem, state: AdjustmentState) -> Problem:
-    """The problem with all rows in use whose residuals a step of at most `_MAX_STEP_S` could explain.
+    """The problem with all rows in use whose residuals a step of at most `MAX_STEP_S` could explain.
 
     A state that is adjusted robustly to many rows rejects the few after a step as outliers.
     """
@@ -417,7 +417,7 @@ def _with_rows_of_a_step(problem: Problem, state: AdjustmentState) -> Problem:
         camera, every = state.cameras[part.camera], part.using(np.ones_like(part.use))
         seen = evaluate_labels([every], camera, paths)
         speed = np.linalg.norm(jacobians(seen, camera, [OFFSET])[:, 3], axis=0)
-        reach = _MAX_STEP_S * speed
+        reach = MAX_STEP_S * speed
         rows.append(part.using(part.use | (seen.valid & (np.linalg.norm(seen.residual, axis=0) < reach))))
     return replace(problem, rows=tuple(rows))
 

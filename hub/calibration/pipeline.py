@@ -6,7 +6,7 @@ No sockets, files or clocks: `syncline calibrate` and the live hub run the same 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -36,6 +36,7 @@ from hub.calibration.pairs.pair_network import (
     solve_pairs,
 )
 from hub.calibration.resection.moved_cameras import moved_cameras, without_moved
+from hub.calibration.resection.set_clocks import between_settings, set_clocks
 from hub.calibration.resection.unconnected import connect_by_resection, listed
 from hub.calibration.result import assemble_calibration, isolated_pair_report
 from hub.calibration.self_calibration import LEAST_CAMERAS, initial_self_calibration, with_updated_lenses
@@ -120,6 +121,10 @@ def calibrate(
             refused=with_known_timing(prepared, pairs),
             warnings=prepared.warnings + frame_rate_warnings(prepared, pairs),
         )
+    may_move = thorough and solver == "joint" and known is None and not prepared.shared_clock
+    again = partial(
+        calibrate, rig, progress=progress, thorough=True, clock_priors=clock_priors, refine_lenses=refine_lenses
+    )
     try:
         if known is not None:
             solution = solve_with_known_poses(prepared, pairs, known, report)
@@ -135,24 +140,39 @@ def calibrate(
             solution = solve_with_unknown_lenses(
                 rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
             )
-        may_move = thorough and solver == "joint" and known is None and not prepared.shared_clock
+        left_out = [name for name in prepared.cameras if name in solution.refused]
+        if may_move and (found := _between_settings(left_out, observations, again)):
+            return found
         if may_move and (moves := moved_cameras(solution, observations)):
             with suppress(Refused):  # what is left says too little: then all rows have to do
-                found = calibrate(
-                    rig, without_moved(observations, moves), progress,
-                    thorough=True, clock_priors=clock_priors, refine_lenses=refine_lenses,
-                )  # fmt: skip
+                found = again(without_moved(observations, moves))
                 warnings = tuple(move.warning(name) for name, move in moves.items())
                 return replace(found, warnings=(*found.warnings, *warnings))
         report("covariances", 0.95)
         return assemble_calibration(rig, solution, refine_lenses=refine_lenses)
     except Refused as refusal:
+        if may_move and (found := _between_settings(prepared.cameras, observations, again)):
+            return found
         failed = ((name, first_failure(tests)) for name, tests in refusal.acceptance.items())
         conflicting = {name: test for name, test in failed if test is not None and test.name == LAG_CONFLICT}
         rejected = [replace(p, status=conflicting[p.b].reason) if p.b in conflicting else p for p in pairs]
         refusal.pairs = tuple(isolated_pair_report(pair, prepared) for pair in rejected)
         refusal.warnings = prepared.warnings
         raise
+
+
+def _between_settings(
+    names: Iterable[str], observations: Observations, again: Callable[[Observations], Calibration]
+) -> Calibration | None:
+    """The calibration from the longest part of these cameras between jumps of their clocks; None if it places none."""
+    if not (clocks := set_clocks(names, observations)):
+        return None
+    try:
+        found = again(between_settings(observations, clocks))
+    except Refused:
+        return None
+    warnings = [clock.warning(name) for name, clock in clocks.items() if name in found.cameras]
+    return replace(found, warnings=(*found.warnings, *warnings)) if warnings else None
 
 
 def _has_bodies(rig: Rig, observations: Observations) -> bool:
