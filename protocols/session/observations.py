@@ -317,7 +317,8 @@ def _check_repeats(
             line=None if line is None else int(line[at].max()),
             remedy="keep one a frame, or give the points different labels",
         )
-    warnings.append(f"{where}: frame numbers repeat ({repeated} of {len(frame)}); only its times are used")
+    repeats = f"{where}: frame numbers repeat ({repeated} of {len(frame)}); only its times are used"
+    warnings.append(f"{repeats}; if it was started twice, name its second run as another camera")
 
 
 def check_columns(header: Sequence[str], required: Sequence[str], file: Path, optional: str = "") -> None:
