@@ -20,6 +20,7 @@ from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.correlation.redetection import Prediction, Redetection
 from edge.uav.correlation.velocity import VelocityFilter
 from edge.uav.image_motion.first_motion import FirstMotion
+from edge.uav.image_motion.median_background import MedianBackground
 from edge.uav.image_motion.residual import UNKNOWN, MovingParts, Residual
 from edge.uav.image_motion.scene_motion import Motion, SceneMotion
 
@@ -339,6 +340,39 @@ def test_a_box_that_stays_with_the_tree_before_it_goes_to_where_its_target_has_m
     found = tracker.handle_frame(behind_a_tree(scene, gone.centre), 0.4)
     assert abs(found.x - gone.x) < 4.0
     assert tracker._motion_filter.velocity[0] < -20.0
+
+
+@pytest.mark.parametrize(("speed", "tracked", "found"), [(0.5, 0.0, True), (0.5, 0.5, False), (0.0, 0.0, False)])
+def test_a_box_on_the_ground_that_its_target_crept_out_of_goes_after_it(
+    scene: Image, speed: float, tracked: float, found: bool
+) -> None:
+    """Something else passes; speeds of the target and of its box over the scene are in lengths a second."""
+    start, step = np.array([160.0, 120.0]), np.array([TARGET[0] / FPS, 0.0])
+    background = MedianBackground(painted(scene, start), OrientedBox(*start, *map(float, TARGET)))
+    still = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), True, 1.0)
+    looks = []
+    for k in range(1, 31):
+        image = painted(scene, start + speed * k * step)
+        cv2.circle(image, (20 + 6 * k, 85), 8, (240, 60, 60), -1)
+        background.move(still, 100.0)
+        box = OrientedBox(*(start + tracked * k * step), *map(float, TARGET))
+        if look := background.look(image, k / FPS, box, True):
+            looks.append(np.append(look[0].centre - start - speed * k * step, look[1] - speed * FPS * step))
+    assert bool(looks) == found
+    assert np.abs(np.array(looks)).max(initial=0.0) < 0.25 * TARGET[0]
+
+
+def test_what_a_target_that_crept_away_looks_like_is_learnt_anew(scene: Image, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = np.array([160.0, 120.0])
+    tracker = AppearanceTracker(SIZE, FPS)
+    tracker.begin(painted(scene, start + [60.0, 0.0]), 0.0, Box(*(start - 0.5 * TARGET), *map(float, TARGET)))
+    gone = OrientedBox(*(start + [60.0, 0.0]), *map(float, TARGET))
+    found = lambda image, seconds, box, seen: (gone, np.array([15.0, 0.0]))  # noqa: E731
+    monkeypatch.setattr(tracker._median_background, "look", found)
+    tracker.handle_frame(painted(scene, gone.centre), 1.2)
+    assert tracker.sees
+    assert tracker._memory.score(painted(scene, gone.centre), gone) > 0.95
+    assert tracker._memory.score(painted(scene, gone.centre), OrientedBox(*start, *map(float, TARGET))) < 0.6
 
 
 def test_while_the_target_is_beyond_the_border_a_place_needs_higher_odds() -> None:
