@@ -19,6 +19,7 @@ from protocols.geometry.types import Floats
 
 _EVERY_S, _UNTIL_S, _IMAGES = 0.2, 3.2, 6  # between two images, and of the last look; least number of images
 _SIDE_PX, _BOX_PX, _REGION = 12, 9, 5  # of a box side in the resampled region, of 0.8; sides of the region, in sides
+_LEAST_PX = 6.0  # side of a box: half a pixel of stabilisation error is then one sample, which differences allow for
 _FASTEST = 1.0  # in box sides a second: what is faster comes apart at once
 _BOUNDS = (-2.0, 3.0)  # of the log likelihood ratio in one image: it may be covered in some
 # Mean log likelihood ratio of a way, and of its first and its last place. In real windows the mean is -2.0 to 0.1 for
@@ -33,7 +34,7 @@ class MedianBackground:
     def __init__(self, image: Image, box: OrientedBox) -> None:
         self._times: list[float] = []
         self._images: list[Image] = []
-        self._ended = not self._keep(image, box, 0.0)
+        self._ended = not self._keep(image, box, 0.0) or bool(box.sides.min() < _LEAST_PX)
 
     def _keep(self, image: Image, scene: OrientedBox, seconds: float) -> bool:
         """Keep the region about the first place; whether all of it is in the image."""
