@@ -1,7 +1,8 @@
 """Any target in any view: cars, boats, bicycles and people in oblique video, also while the camera looks away.
 
     python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique]
-        [--first-seed 0] [--ranges 1,2.5,4] [--screens 0] [--covered] [--light dusk] [--stabilisation] [--json]
+        [--first-seed 0] [--ranges 1,2.5,4] [--screens 0] [--covered] [--first-start 0] [--mirrored 0.6]
+        [--light dusk] [--stabilisation] [--json]
 
 Rendered oblique flights with truth, and where the data folder has them real ones: whole sequences, and windows that pan
 away from the target for 0.5 to 4 s and come back. No lens, no telemetry.
@@ -25,7 +26,7 @@ from edge.uav.image_motion.scene_motion import SceneMotion
 from protocols.geometry.types import Floats
 from tests.bench import uav_rivals
 from tests.bench.real_rigs import DEFAULT_DATA
-from tests.bench.uav_sequences import AWAY_S, Sequence, aerial, oblique, pan_away, share_inside
+from tests.bench.uav_sequences import AWAY_S, Sequence, aerial, mirrored, oblique, pan_away, share_inside
 from tests.support.oblique.world import FLIGHTS, TARGETS, ObliqueWorld
 
 MODELS = ("ground", *uav_rivals.NAMES)
@@ -157,16 +158,21 @@ def rendered(
                     yield sequence
 
 
-def real(data: Path, windows: bool = True) -> Iterator[Sequence]:
-    """Sequences of the data folder, and windows in them that pan away."""
+def real(data: Path, windows: bool = True, first: int = 0, factor: float | None = None) -> Iterator[Sequence]:
+    """Sequences of the data folder, and windows in them that pan away.
+
+    first: start of the first window in each oblique one [frames]. factor: by which these are reduced, and mirrored.
+    """
     if (data / "oblique").is_dir():
         yield from oblique(data / "oblique")
     if (data / "oblique").is_dir() and windows:
+        size = (640, 360) if factor is None else (round(640 * factor), round(360 * factor))
         for whole in oblique(data / "oblique", None, 10**6):
+            whole = whole if factor is None else mirrored(whole, factor)
             for k, away in enumerate(AWAY_S):
-                for start in range(0, len(whole.images), 60):
-                    window = pan_away(whole, away, (640, 360), 2.0, k + start, start)
-                    if window is not None:
+                for start in range(first, len(whole.images), 60):
+                    window = pan_away(whole, away, size, 2.0, k + start, start)
+                    if window is not None and window.box[0, 2:].min() >= _LEAST_PX:
                         yield window
     if (data / "aerial-traffic").is_dir() and windows:
         for whole in aerial(data / "aerial-traffic"):
@@ -241,6 +247,8 @@ def main() -> None:
     parser.add_argument("--ranges", default="1", help="of rendered flights, over the usual range: 4 makes a car 12 px")
     parser.add_argument("--screens", type=int, default=0, help="trees and poles before the target, rendered flights")
     parser.add_argument("--covered", action="store_true", help="mark the target as it goes behind one of them")
+    parser.add_argument("--first-start", type=int, default=0, help="first frame of the first window of oblique clips")
+    parser.add_argument("--mirrored", type=float, help="windows of the mirrored clips, reduced to this share: 0.6")
     parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
     parser.add_argument("--light", default="", help="change the images: dusk, haze, flicker")
     parser.add_argument("--stabilisation", action="store_true", help="only: how well the real videos are stabilised")
@@ -262,7 +270,8 @@ def main() -> None:
         ranges = [float(factor) for factor in options.ranges.split(",")]
         sources.append(rendered(seeds, ranges, kinds, options.screens, options.covered))
     if not kinds or any(not kind.startswith("rendered") for kind in kinds):
-        sources.append(real(options.data, not kinds or any("away" in kind for kind in kinds)))
+        windows = not kinds or any("away" in kind for kind in kinds)
+        sources.append(real(options.data, windows, options.first_start, options.mirrored))
     light = options.light
     scores = [
         run(replace(s, images=[in_light(i, light, k) for k, i in enumerate(s.images)]) if light else s, model)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -73,6 +73,16 @@ def oblique(folder: Path, width: int | None = 640, most: int = 300) -> Iterator[
         images = images[:n]
         size = (images[0].shape[1], images[0].shape[0])
         yield Sequence(file.parent.name, "oblique", images, box, 10.0, share_inside(box, size))
+
+
+def mirrored(whole: Sequence, factor: float) -> Sequence:
+    """A sequence with left and right exchanged, reduced by ``factor``."""
+    box = factor * whole.box
+    images = [
+        cv2.resize(image[:, ::-1], None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) for image in whole.images
+    ]
+    box[:, 0] = images[0].shape[1] - box[:, 0] - box[:, 2]
+    return replace(whole, images=[np.asarray(image, np.uint8) for image in images], box=box)
 
 
 def aerial(folder: Path) -> Iterator[Sequence]:

@@ -25,6 +25,7 @@ from edge.uav.correlation.search import search, tile
 from edge.uav.correlation.shape import Outline
 from edge.uav.correlation.velocity import VelocityFilter
 from edge.uav.image_motion.first_motion import FirstMotion
+from edge.uav.image_motion.median_background import MedianBackground
 from edge.uav.image_motion.residual import MovingParts
 from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
 from edge.uav.target.box import check_target_box
@@ -40,6 +41,7 @@ _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at whic
 _MOVED = 2.0  # distance within which what moves is looked for, in target lengths
 _SLIP_STD = 0.35  # of a box that has slipped off its target, in target lengths: the two still overlap
 _STAYED = 0.3  # distance of a box from where its target has moved at first, in sides, at which it goes there
+_LIKE_FIRST = 0.65  # similarity to the first view above which a box holds its target: of what was left 0.6 or less
 _FIRST_STD = 0.2  # of that velocity, in lengths a second: a cell of a side within the first second
 _STANDS = -0.3  # log likelihood ratio below which a place stands and the target moves
 _WINDOW = 1.2  # half of the region that the filter sees, in target lengths
@@ -76,12 +78,26 @@ class AppearanceTracker:
         self._first = self.box.sides
         self._motion_filter = VelocityFilter(self.length)
         self._turn_rate = 0.0
-        self._filter = CorrelationFilter(target.width, target.height)
-        self._scale, self._flow, self._memory = ScaleFilter(), BoxFlow(), TemplateMemory()
         self._scene.update(image, None)
         image = self._scene.photometric.corrected(image)  # begun again, what is learnt has the exposure of the first
         self.motion: Motion = STILL
         self._trusted_at = -np.inf
+        self._learn_first(image)
+        self._ratio, self._learn_above = 0.0, _LEARN_ABOVE
+        self._expected: Estimate | None = None
+        self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
+        self._other_std = np.inf
+        self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
+        self._parts = MovingParts(image, self._time, self.box)
+        self._begun, self._first_motion = time, FirstMotion(image, self.box)
+        self._first_place: OrientedBox | None = self.box
+        self._median_background = MedianBackground(image, self.box)
+        return self._estimate(time)
+
+    def _learn_first(self, image: Image) -> None:
+        """Learn from the target's box what it looks like, without anything before."""
+        self._filter = CorrelationFilter(self.box.width, self.box.height)
+        self._scale, self._flow, self._memory = ScaleFilter(), BoxFlow(), TemplateMemory()
         self._filter.learn(image, self.box)
         self._scale.learn(image, self.box)
         self._flow.remember(image, self.box)
@@ -89,18 +105,8 @@ class AppearanceTracker:
         self._colour = ColourModel(image, self.box)
         self._observe_background(image, self.box)
         self._shape = Outline(image, self.box)
-        self._missed, self._unseen_s = 0, 0.0
+        self._missed, self._unseen_s, self._searching, self._belief = 0, 0.0, False, Belief()
         self._redetection = Redetection(self._size, self._memory, self._respond, self._colour)
-        self._ratio, self._learn_above = 0.0, _LEARN_ABOVE
-        self._expected: Estimate | None = None
-        self._sure = self.box, copy(self._motion_filter)  # when the evidence was last clear, predicted since
-        self._other_std = np.inf
-        self._heading = float("nan")  # of the other tracker's estimate, at the last sight [rad]
-        self._belief = Belief()
-        self._searching = False
-        self._parts = MovingParts(image, self._time, self.box)
-        self._begun, self._first_motion = time, FirstMotion(image, self.box)
-        return self._estimate(time)
 
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
         """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
@@ -117,10 +123,7 @@ class AppearanceTracker:
         image = self._scene.photometric.corrected(image)
         origin = self._predict(dt)
         self._parts.update(image, self._time, self.box, self.motion, place, origin)
-        self._first_motion.move(self.motion, self._scene.reach)
-        moved = self._first_motion.look(image, self._time - self._begun)
-        if moved is not None:
-            self._follow(*moved)
+        self._follow_first_motion(image)
         if not self._searching:
             self._track(image, dt)
         else:
@@ -205,12 +208,26 @@ class AppearanceTracker:
             if not self.motion.trusted:
                 self._sure = self.box, copy(self._motion_filter)
 
-    def _follow(self, place: OrientedBox, velocity: Floats) -> None:
+    def _follow_first_motion(self, image: Image) -> None:
         """Go to where the target has surely moved, if the box has stayed with what its first box showed, too."""
-        if np.hypot(*((place.centre - self.box.centre) / place.sides)) > _STAYED:
-            self.box = place
-            self._motion_filter.restart(velocity, _FIRST_STD * self.length, self.length)
-            self._sure = place, copy(self._motion_filter)
+        if self._first_place is not None:
+            self._first_place = self.motion.followed(self._first_place, self._scene.reach)
+        if self._first_place is None:
+            return
+        seconds = self._time - self._begun
+        moved = self._first_motion.look(image, seconds, self._first_place)
+        if moved is not None and np.hypot(*((moved[0].centre - self.box.centre) / moved[0].sides)) > _STAYED:
+            self._go_to(*moved)
+        seen = self.box if self.sees else None  # while it is not, it may be hidden, and what moves is something else
+        crept = self._median_background.look(image, seconds, self._first_place, seen)
+        if crept is not None and self._memory.first_scores(image, [self.box])[0] < _LIKE_FIRST:
+            self._go_to(*crept)
+            self._learn_first(image)
+
+    def _go_to(self, place: OrientedBox, velocity: Floats) -> None:
+        self.box = place
+        self._motion_filter.restart(velocity, _FIRST_STD * self.length, self.length)
+        self._sure = place, copy(self._motion_filter)
 
     def _track(self, image: Image, dt: float) -> None:
         """Measure the target about its prediction."""

@@ -14,7 +14,6 @@ from edge.uav.base import Image
 from edge.uav.correlation.features import Features, cell_features
 from edge.uav.correlation.memory import CELL_PX, CELLS
 from edge.uav.correlation.oriented_box import OrientedBox, crop
-from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats
 
 _LOOKS_S, _LAST_S = 0.2, 1.2  # between two looks; the last one: later, the target has turned or is covered
@@ -31,24 +30,18 @@ class FirstMotion:
 
     def __init__(self, image: Image, box: OrientedBox) -> None:
         self._first = _cells(image, box, CELLS)
-        self._scene: OrientedBox | None = box  # where the scene is now that the first box showed
+        self._ended = False
         self._looks = 0
         self._velocities = np.meshgrid(*[np.linspace(-_FASTEST, _FASTEST, _STEPS)] * 2)
         self._evidence: Floats = np.zeros((_STEPS, _STEPS))
 
-    def move(self, motion: Motion, reach: float) -> None:
-        """Follow the scene into the next image; see ``Motion.at``."""
-        if self._scene is not None:
-            scene = motion.moved(self._scene.at(motion.at(self._scene.centre, reach)))
-            self._scene = scene if motion.trusted else None
-
-    def look(self, image: Image, seconds: float) -> tuple[OrientedBox, Floats] | None:
+    def look(self, image: Image, seconds: float, scene: OrientedBox) -> tuple[OrientedBox, Floats] | None:
         """Where the target is, ``seconds`` after the first image, and its velocity (2,) over the scene [px/s].
 
-        None where no velocity explains what was seen, or more than one does.
+        scene: where the scene is now that the first box showed. None where no velocity explains what was seen, or more
+        than one does.
         """
-        scene = self._scene
-        if scene is None or not _LOOKS_S * (self._looks + 1) <= seconds + 1e-6 <= _LAST_S + 2e-6:
+        if self._ended or not _LOOKS_S * (self._looks + 1) <= seconds + 1e-6 <= _LAST_S + 2e-6:
             return None
         self._looks += 1
         now, own = _cells(image, scene, 3 * CELLS), slice(CELLS, 2 * CELLS)
@@ -62,7 +55,7 @@ class FirstMotion:
         best = int(self._evidence.argmax())
         velocity = np.array([v.flat[best] for v in self._velocities])
         if np.abs(velocity).max() * seconds > 1.0 - 1.0 / CELLS:
-            self._scene = None  # it leaves the region, in which something slower would fit better from now on
+            self._ended = True  # it leaves the region, in which something slower would fit better from now on
             return None
         apart = np.hypot(*(v - v.flat[best] for v in self._velocities)) * seconds > _APART
         least = max(_LEAST * self._looks, _MARGIN * float(self._evidence[apart].max(initial=0.0)))

@@ -18,6 +18,8 @@ from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats
 
+Singles = npt.NDArray[np.float32]
+
 _APART_S = 0.35  # between the images that are compared
 _KEEP_S = 0.08  # between two that are kept
 _SIDE_PX = 14.0  # geometric mean of the target's sides in the reduced image, at least
@@ -25,7 +27,7 @@ _MAX_PX = 140  # side of the region that is searched [px, reduced]
 # Of the log ratio in rendered flights: what moves by 2 px or more (mean, std of what is below), what stands; bounds
 # of the share of the places beside a target where something else moves, which is counted.
 _MOVING, _STANDING_STD, _OTHERS = (2.0, 0.7), 0.25, (0.03, 0.3)
-_SURELY = 2.2  # ratio of what moves
+SURELY = 2.2  # ratio of what moves
 _BOUNDS = (0.1, 0.9)  # of the probability that the target moves
 _LEARNING, _FIRST_LEARNING = 0.1, 0.4  # share of a new observation of whether the target moves
 _FLOOR = 1.5  # grey levels of difference that noise and compression leave
@@ -39,7 +41,7 @@ class Residual:
     share of the places where something moves.
     """
 
-    ratio: npt.NDArray[np.float32]
+    ratio: Singles
     scale: float
     low: Floats
     moves: float
@@ -52,10 +54,8 @@ class Residual:
         ratio = float(self.ratio[y - 1 : y + 2, x - 1 : x + 2].max()) if inside else 0.0
         if ratio == 0.0:
             return 1.0, 1.0
-        value = max(float(np.log(ratio)), 0.0)
-        moving = np.exp(-0.5 * (min(value - _MOVING[0], 0.0) / _MOVING[1]) ** 2) / (2.5 * _MOVING[1])
-        standing = 2.0 * np.exp(-0.5 * (value / _STANDING_STD) ** 2) / (2.5 * _STANDING_STD)
-        return float(moving), float((1.0 - self.others) * standing + self.others * moving + 1e-3)
+        moving, standing = densities(np.array(ratio), self.others)
+        return float(moving), float(standing)
 
     def log_ratio(self, place: Floats) -> float:
         """log p(residual | target) - log p(residual | anything else) at a place (2,) [px], natural."""
@@ -67,12 +67,38 @@ class Residual:
         left, out = self.ratio.copy(), []
         for _ in range(most):
             y, x = divmod(int(left.argmax()), left.shape[1])
-            if left[y, x] < _SURELY:
+            if left[y, x] < SURELY:
                 break
             out.append(self.low + self.scale * np.array([x, y]))
             dx, dy = np.maximum(apart / self.scale, 1.0).astype(int)
             left[max(y - dy, 0) : y + dy + 1, max(x - dx, 0) : x + dx + 1] = 0.0
         return out
+
+
+def difference(new: Image, before: Image) -> Image:
+    """Difference (h, w) of the values of an image to those that its neighbours span in an earlier one."""
+    kernel = np.ones((3, 3), np.uint8)
+    above, below = cv2.subtract(new, cv2.dilate(before, kernel)), cv2.subtract(cv2.erode(before, kernel), new)
+    return np.asarray(np.maximum(above, below).max(axis=2), np.uint8)
+
+
+def ratio_to_median(differs: Image, side: tuple[int, int]) -> Singles:
+    """Ratio (h, w) of the mean difference in boxes (width, height) about each pixel to the median one."""
+    mean = cv2.boxFilter(differs, cv2.CV_32F, side)
+    return np.asarray((mean + _FLOOR) / (float(np.median(mean)) + _FLOOR), np.float32)
+
+
+def share_moving(ratio: Singles) -> float:
+    """Share of the places where something moves, within bounds."""
+    return float(np.clip((ratio > SURELY).mean(), *_OTHERS))
+
+
+def densities(ratio: Singles, others: float) -> tuple[Floats, Floats]:
+    """Densities of the logs of positive ratios, for what moves and for what stands among ``others`` that move."""
+    value = np.maximum(np.log(ratio), 0.0)
+    moving = np.exp(-0.5 * (np.minimum(value - _MOVING[0], 0.0) / _MOVING[1]) ** 2) / (2.5 * _MOVING[1])
+    standing = 2.0 * np.exp(-0.5 * (value / _STANDING_STD) ** 2) / (2.5 * _STANDING_STD)
+    return moving, (1.0 - others) * standing + others * moving + 1e-3
 
 
 UNKNOWN = Residual(np.zeros((1, 1), np.float32), 1.0, np.zeros(2), 0.0)
@@ -132,16 +158,16 @@ class MovingParts:
             _, old, since = min(self._past, key=lambda kept: abs(time - kept[0] - age))
             inverse = np.linalg.inv(since)[:2]
             inverse[:, 2] += inverse[:, :2] @ low
-            flags, kernel = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, np.ones((3, 3), np.uint8)
-            before = cv2.warpAffine(old, inverse, window, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            before = np.asarray(
+                cv2.warpAffine(old, inverse, window, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8
+            )
             known = cv2.warpAffine(np.full(old.shape[:2], 255, np.uint8), inverse, window, flags=flags)
-            above, below = cv2.subtract(new, cv2.dilate(before, kernel)), cv2.subtract(cv2.erode(before, kernel), new)
-            least, seen = np.minimum(least, np.maximum(above, below).max(axis=2)), np.minimum(seen, known)
+            least, seen = np.minimum(least, difference(new, before)), np.minimum(seen, known)
         side = np.maximum(np.rint(0.8 * box.extent / self._reduction), 3).astype(int)
-        mean = cv2.boxFilter(least, cv2.CV_32F, (int(side[0]), int(side[1])))
-        ratio = (mean + _FLOOR) / (float(np.median(mean)) + _FLOOR)
+        ratio = ratio_to_median(least, (int(side[0]), int(side[1])))
         ratio[cv2.erode(seen, np.ones((int(side[1]), int(side[0])), np.uint8)) < 255] = 0.0
-        others = float(np.clip((ratio > _SURELY).mean(), *_OTHERS))
+        others = share_moving(ratio)
         scale = float(self._reduction)
         found = Residual(ratio, scale, scale * (low + 0.5) - 0.5, self._moves, others)
         if known_s > 1.5 * _APART_S:

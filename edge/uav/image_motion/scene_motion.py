@@ -58,6 +58,10 @@ class Motion:
         """A box turned and sized with the scene, about the same centre."""
         return box.sized(box.sides * self.zoom).turned(float(np.arctan2(self.matrix[1, 0], self.matrix[0, 0])))
 
+    def followed(self, place: OrientedBox, reach: float) -> OrientedBox | None:
+        """A box about a place of the static scene, moved with it; see ``at``. None where the motion is not trusted."""
+        return self.moved(place.at(self.at(place.centre, reach))) if self.trusted else None
+
     def at(self, point: Floats, reach: float) -> Floats:
         """Where the static scene at ``point`` (2,) [px] has moved, with the parallax of the tracks within ``reach``."""
         moved = self.matrix[:, :2] @ point + self.matrix[:, 2]

@@ -20,6 +20,7 @@ from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.correlation.redetection import Prediction, Redetection
 from edge.uav.correlation.velocity import VelocityFilter
 from edge.uav.image_motion.first_motion import FirstMotion
+from edge.uav.image_motion.median_background import MedianBackground
 from edge.uav.image_motion.residual import UNKNOWN, MovingParts, Residual
 from edge.uav.image_motion.scene_motion import Motion, SceneMotion
 
@@ -306,26 +307,30 @@ def behind_a_tree(scene: Image, place: np.ndarray) -> Image:
 
 def test_the_first_motion_is_of_what_moves_also_where_a_tree_fills_half_of_the_box(scene: Image) -> None:
     start = np.array([70.0, 120.0])
-    first = FirstMotion(behind_a_tree(scene, start), OrientedBox(*start, *map(float, TARGET)))
-    still = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), True, 1.0)
+    place = OrientedBox(*start, *map(float, TARGET))
+    first = FirstMotion(behind_a_tree(scene, start), place)
     looks = []
     for k in range(1, 16):
-        first.move(still, 100.0)
-        looks.append(first.look(behind_a_tree(scene, start - [2.0 * k, 0.0]), k / FPS))
+        looks.append(first.look(behind_a_tree(scene, start - [2.0 * k, 0.0]), k / FPS, place))
     place, velocity = next(look for look in looks if look is not None)
     k = next(k for k, look in enumerate(looks, 1) if look is not None)
     assert np.hypot(*(place.centre - start + [2.0 * k, 0.0])) < 0.25 * TARGET[0]
     assert np.abs(velocity - [-30.0, 0.0]).max() < 0.35 * TARGET[0]
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["it stands", "the scene's motion is lost"])
-def test_of_what_stands_or_of_a_scene_that_is_lost_there_is_no_first_motion(scene: Image, known: bool) -> None:
-    start = np.array([70.0, 120.0])
-    first = FirstMotion(behind_a_tree(scene, start), OrientedBox(*start, *map(float, TARGET)))
-    step = np.zeros(2) if known else np.array([-2.0, 0.0])
+def test_of_what_stands_there_is_no_first_motion(scene: Image) -> None:
+    place = OrientedBox(70.0, 120.0, *map(float, TARGET))
+    first = FirstMotion(behind_a_tree(scene, place.centre), place)
     for k in range(1, 20):
-        first.move(Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), known, 1.0), 100.0)
-        assert first.look(behind_a_tree(scene, start + k * step), k / FPS) is None
+        assert first.look(behind_a_tree(scene, place.centre), k / FPS, place) is None
+
+
+def test_a_place_is_not_followed_where_the_motion_of_the_scene_is_lost() -> None:
+    place = OrientedBox(70.0, 120.0, *map(float, TARGET))
+    shift = np.array([[1.0, 0.0, 3.0], [0.0, 1.0, 0.0]])
+    for known in (True, False):
+        moved = Motion(shift, np.zeros((0, 2)), np.zeros((0, 2)), known, 1.0).followed(place, 100.0)
+        assert moved == (place.at(np.array([73.0, 120.0])) if known else None)
 
 
 def test_a_box_that_stays_with_the_tree_before_it_goes_to_where_its_target_has_moved(
@@ -335,10 +340,44 @@ def test_a_box_that_stays_with_the_tree_before_it_goes_to_where_its_target_has_m
     tracker = AppearanceTracker(SIZE, FPS)
     tracker.begin(behind_a_tree(scene, start), 0.0, Box(*(start - 0.5 * TARGET), *map(float, TARGET)))
     gone = OrientedBox(*(start - [12.0, 0.0]), *map(float, TARGET))
-    monkeypatch.setattr(tracker._first_motion, "look", lambda image, seconds: (gone, np.array([-30.0, 0.0])))
+    monkeypatch.setattr(tracker._first_motion, "look", lambda image, seconds, scene: (gone, np.array([-30.0, 0.0])))
     found = tracker.handle_frame(behind_a_tree(scene, gone.centre), 0.4)
     assert abs(found.x - gone.x) < 4.0
     assert tracker._motion_filter.velocity[0] < -20.0
+
+
+@pytest.mark.parametrize(("speed", "tracked", "found"), [(0.5, 0.0, True), (0.5, 0.5, False), (0.0, 0.0, False)])
+def test_a_box_on_the_ground_that_its_target_crept_out_of_goes_after_it(
+    scene: Image, speed: float, tracked: float, found: bool
+) -> None:
+    """Something else passes; speeds of the target and of its box over the scene are in lengths a second."""
+    start, step = np.array([160.0, 120.0]), np.array([TARGET[0] / FPS, 0.0])
+    background = MedianBackground(painted(scene, start), OrientedBox(*start, *map(float, TARGET)))
+    first, looks = OrientedBox(*start, *map(float, TARGET)), []
+    for k in range(1, 31):
+        image = painted(scene, start + speed * k * step)
+        cv2.circle(image, (20 + 6 * k, 85), 8, (240, 60, 60), -1)
+        box = first.at(start + tracked * k * step)
+        if look := background.look(image, k / FPS, first, box):
+            looks.append(np.append(look[0].centre - start - speed * k * step, look[1] - speed * FPS * step))
+    assert bool(looks) == found
+    assert np.abs(np.array(looks)).max(initial=0.0) < 0.25 * TARGET[0]
+
+
+def test_what_a_target_that_crept_away_looks_like_is_learnt_anew(scene: Image, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = np.array([160.0, 120.0])
+    tracker = AppearanceTracker(SIZE, FPS)
+    tracker.begin(painted(scene, start + [60.0, 0.0]), 0.0, Box(*(start - 0.5 * TARGET), *map(float, TARGET)))
+    gone = OrientedBox(*(start + [60.0, 0.0]), *map(float, TARGET))
+    found = lambda image, seconds, scene, box: (gone, np.array([15.0, 0.0]))  # noqa: E731
+    monkeypatch.setattr(tracker._median_background, "look", found)
+    tracker.handle_frame(painted(scene, gone.centre), 1.2)
+    still_like_the_first_view = tracker._memory.score(painted(scene, gone.centre), gone)
+    tracker._memory._templates[0] = -tracker._memory._templates[0]
+    tracker.handle_frame(painted(scene, gone.centre), 1.4)
+    assert still_like_the_first_view < 0.6
+    assert tracker.sees
+    assert tracker._memory.score(painted(scene, gone.centre), gone) > 0.95
 
 
 def test_while_the_target_is_beyond_the_border_a_place_needs_higher_odds() -> None:
