@@ -100,7 +100,7 @@ def follow(
             warnings.append("the vertical is unknown: targets are followed as points, without a ground")
     units_per_m = 1.0 / METRES_PER_UNIT[calibration.units] if calibration.scale == "metric" else 1.0
     scale = LengthScale(units_per_m, calibration.scale == "metric")
-    # The whole recording tells who has left: until then nobody is given up soon.
+    # Who has left is known from the whole recording: until its end nobody is given up soon.
     parameters = TrackerParameters(up=up, scale=scale, lifetime_s=60.0)
     said = progress or (lambda share: None)
     state = MultiTargetState.empty()

@@ -35,10 +35,10 @@ def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Ob
         )
     rig = read_rig(folder / RIG_FILE)
     found = read_observations(observations or folder / OBSERVATIONS_FILE, rig.cameras)
-    return rig, replace(found, warnings=found.warnings + doubtful_columns(rig, found) + misspelt_keys(rig))
+    return rig, replace(found, warnings=found.warnings + column_warnings(rig, found) + misspelt_keys(rig))
 
 
-def doubtful_columns(rig: Rig, observations: Observations) -> tuple[str, ...]:
+def column_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
     """Warnings for cameras with many rows outside their image (a wrong size, or u and v swapped), or with times that
     are frame numbers or milliseconds."""
     warnings = []

@@ -12,7 +12,7 @@ import tomli_w
 
 from protocols.core.errors import InputError
 from protocols.core.tables import dataframe
-from protocols.session.folder import doubtful_columns
+from protocols.session.folder import column_warnings
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
 from protocols.session.rig import Rig, parse_rig
 
@@ -74,7 +74,7 @@ class Session:
         found = gather_tracks(
             cameras, labels, frame, given["time"], np.column_stack([given["u"], given["v"]]), size, order=rig.cameras
         )
-        found = replace(found, warnings=found.warnings + doubtful_columns(rig, found))
+        found = replace(found, warnings=found.warnings + column_warnings(rig, found))
         return cls(rig, found, found.warnings, name)
 
     def to_dataframe(self) -> pandas.DataFrame:
