@@ -6,6 +6,7 @@ Subcommands are imported when they are called, so that `--help` takes a fraction
 from __future__ import annotations
 
 import difflib
+import gc
 import io
 import os
 import resource
@@ -22,11 +23,15 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: what is wrong with a video is said in one line
 
+gc.disable()  # nothing of what is imported is garbage: to search it took a thirtieth of a short command's time
 from cyclopts import App, CycloptsError  # noqa: E402
 from cyclopts.exceptions import UnknownCommandError  # noqa: E402
 
 from protocols.core.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT, SynclineError  # noqa: E402
 from protocols.core.version import VERSION  # noqa: E402
+
+gc.freeze()
+gc.enable()
 
 # Name, module below deploy.commands and function, one-line summary for the overview.
 COMMANDS: tuple[tuple[str, str, str], ...] = (

@@ -166,15 +166,17 @@ def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) 
     lines: list[int] = []
     try:
         for row in reader:
-            if any(cell.strip() for cell in row):
+            if "".join(row).strip():
                 rows.append(row)
                 lines.append(reader.line_num)
     except csv.Error as error:
         raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
     if not rows:
         raise InputError("no rows", file=file, line=1, remedy="record some observations first")
+    last = max(columns[name] for name in columns if name in used)
     for row, line in zip(rows, lines, strict=True):
-        check_width(row, line, len(header), max(columns[name] for name in columns if name in used), file)
+        if len(row) != len(header):
+            check_width(row, line, len(header), last, file)
     numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
     far = np.flatnonzero(np.abs(numbers["time"]) > MAX_TIME_S)
     if len(far):
