@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.bundle import model_comparison
+from hub.bundle import clock_steps, model_comparison
 from hub.bundle.adjustment import adjust
 from hub.bundle.initialisation import Reconstruction, sigma_limit
 from hub.bundle.noise.correlated_noise import refit_with_correlated_noise
@@ -27,11 +27,11 @@ _MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
     """Problem and state with the rows after clock steps corrected, as far as these explain the observations better."""
     for _ in range(MAX_CLOCK_STEPS):
-        step = model_comparison.find_clock_step(problem, state)
+        step = clock_steps.find_clock_step(problem, state)
         if step is None:
             break
         trial, found = _with_sizes(problem, state, step)
-        supported = all(model_comparison.is_step_supported(problem, one) for one in found.clock_steps)
+        supported = all(clock_steps.is_step_supported(problem, one) for one in found.clock_steps)
         if not supported or not _bic_prefers(trial, found, problem, state, 2):
             break
         problem, state = trial, found
@@ -53,7 +53,7 @@ def _with_fewer_steps(
     times = [state.cameras[one.camera].reference_time(np.array([one.time])) for one in steps]
     same = (ClockStep(last, float(state.cameras[last].camera_time(one)[0]), size, np.inf, 0.0) for one in times)
     best = max((_with_sizes(*even, one) for one in same), key=lambda tried: _gain(tried[0], tried[1], *even)[0])
-    supported = model_comparison.is_step_supported(best[0], best[1].clock_steps[-1])
+    supported = clock_steps.is_step_supported(best[0], best[1].clock_steps[-1])
     return found if not supported or _bic_prefers(*found, *best, 2 * (len(steps) - 1)) else best
 
 
@@ -68,14 +68,14 @@ def _steps_or_rates(
     if all(model_comparison.with_crystal_rates(*found).crystal_rates):
         return found
     # Free rates and steps explain no less than steps alone: where none seems to add to them, none replaces them.
-    if model_comparison.likely_clock_steps(*found) == ():
+    if clock_steps.likely_clock_steps(*found) == ():
         return found
     rate = float(np.median([camera.rate for camera in state.cameras]))
     alike = tuple(replace(camera, rate=rate) for camera in state.cameras)
     held = replace(problem, crystal_rates=(True,) * len(alike))
     stepped = _with_clock_steps(*adjust(held, replace(state, cameras=alike), rounds=4)[:2])
     # As much as it takes to look for the steps: lenses that are wrong by slow errors make false rates, and false steps.
-    needed = len(stepped[1].clock_steps) * model_comparison.needed_for_a_step(problem)
+    needed = len(stepped[1].clock_steps) * clock_steps.needed_for_a_step(problem)
     return stepped if needed and _gain(*stepped, *found)[0] > needed else found
 
 
@@ -90,9 +90,9 @@ def _with_sizes(problem: Problem, state: AdjustmentState, new: ClockStep) -> tup
         found = problem
         for one, done in zip(steps, corrected, strict=True):
             change = replace(one, size=one.size - done)
-            found = model_comparison.with_clock_step(found, change, state.cameras[one.camera].centre)
+            found = clock_steps.with_clock_step(found, change, state.cameras[one.camera].centre)
         found, trial, _ = adjust(found, trial, rounds=2)
-        rest = [model_comparison.remaining_step(found, trial, one.camera, one.time) for one in steps]
+        rest = [clock_steps.remaining_step(found, trial, one.camera, one.time) for one in steps]
         steps = [replace(one, std=more.std) for one, more in zip(steps, rest, strict=True)]
         if all(abs(more.size) < _STEP_TOLERANCE * more.std for more in rest) or not left:
             break
@@ -137,7 +137,7 @@ def final_adjustment(
             return replace(reconstruction, problem=refitted[0], state=refitted[1])
     if not online and any(one > sigma_limit(state, camera) for camera, one in enumerate(state.sigma)):
         lens = wrong_lens(problem, state)
-        step = None if lens is None else model_comparison.find_clock_step(problem, state)
+        step = None if lens is None else clock_steps.find_clock_step(problem, state)
         if lens is not None and (step is None or step.statistic < lens.statistic):
             return reconstruction  # the camera will be left out
     problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))

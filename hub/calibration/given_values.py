@@ -39,7 +39,7 @@ def refuted_lens_warnings(
     remedy = "correct it" if refine_lenses else "correct it, or estimate it with --refine-lenses"
     return tuple(
         f"{names[one.camera]}: {refuted_lens(one)}; it was kept as given: {remedy}"
-        for one in refuted_lenses(problem, state) or refuted_lenses(problem, state, LENS[:2])
+        for one in refuted_lenses(problem, state, LENS, LENS[:2])
     )
 
 

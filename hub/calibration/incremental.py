@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.bundle import model_comparison
+from hub.bundle import clock_steps
 from hub.bundle.initialisation import (
     Reconstruction,
     place_cameras,
@@ -206,7 +206,7 @@ def _clock_step(
 
     First one that is not known; then what is left of a known one, where that is more than its std.
     """
-    found = model_comparison.find_clock_step(reconstruction.problem, reconstruction.state)
+    found = clock_steps.find_clock_step(reconstruction.problem, reconstruction.state)
     if found is None:
         for scale, step, left in _remaining_steps(steps, prepared, reconstruction):
             if abs(left.size) > left.std or left.std < _BETTER_KNOWN * scale * step[2]:
@@ -226,7 +226,7 @@ def _remaining_steps(
         scale, origin = prepared.time_scale(name), prepared.time_origins[name]
         for step in steps.get(name, ()):
             at = scale * (shown_since(steps, name, step) - origin)
-            yield scale, step, model_comparison.remaining_step(reconstruction.problem, reconstruction.state, number, at)
+            yield scale, step, clock_steps.remaining_step(reconstruction.problem, reconstruction.state, number, at)
 
 
 def _are_supported(
@@ -234,7 +234,7 @@ def _are_supported(
 ) -> bool:
     """Whether all steps are as large as a step has to be, in the adjustment to the rows on the corrected clocks."""
     return all(
-        model_comparison.is_step_supported(reconstruction.problem, replace(left, size=scale * step[1] + left.size))
+        clock_steps.is_step_supported(reconstruction.problem, replace(left, size=scale * step[1] + left.size))
         for scale, step, left in _remaining_steps(steps, prepared, reconstruction)
     )
 

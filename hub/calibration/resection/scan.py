@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.fft import irfft, rfft
 
+from hub.bundle.clock_steps import STEP_SIZES, best_split
 from hub.bundle.initialisation import CameraInput, Reconstruction, observation_times, seen_by_two
-from hub.bundle.model_comparison import STEP_SIZES, best_split
 from hub.bundle.problem import CameraState, Trajectory
 from hub.clocks.clock_graph import TimeMapEstimate
 from hub.sync.lag_scan import fast_length, grid_tracks

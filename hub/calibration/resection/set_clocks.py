@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.bundle.model_comparison import MAX_STEP_S
+from hub.bundle.clock_steps import MAX_STEP_S
 from hub.trajectory.image_tracks import BRIDGED_INTERVALS
 from protocols.session.observations import Observations
 
