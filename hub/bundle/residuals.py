@@ -29,6 +29,7 @@ from hub.bundle.problem import (
     Trajectory,
 )
 from hub.trajectory.splines import weighted_sums
+from protocols.geometry import kernels
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Bools, Floats, Ints
 
@@ -59,8 +60,8 @@ class ResidualEvaluation:
     residual: (2, n) [px]. valid: (n,) whether the path is defined and in front of the camera; elsewhere the numbers are
     finite but meaningless. time: (n,) on the camera's clock, corrected for readout. index, weights, slope_weights:
     support in ``control`` (size, 3), the path's or all paths' control points. camera_points: (3, n) in camera axes.
-    normalised: (2, n) undistorted. distortion_jacobian: (n, 2, 2) derivative of distorted by undistorted coordinates,
-    where it was computed with the residuals. relative_information: (n,) of the rows, by their relative stds. along: the
+    normalised: (2, n) undistorted. distortion_jacobian: (2, 2, n) derivative of distorted by undistorted coordinates,
+    None of a fisheye lens. relative_information: (n,) of the rows, by their relative stds. along: the
     directions of motion (2, n), and by what `whitened` ones are shortened along them (n,); None = not at all.
     """
 
@@ -177,26 +178,7 @@ def evaluate_points(
     relative_information: Floats,
 ) -> ResidualEvaluation:
     """Residuals of pixels (n, 2) of world points (n, 3), which are defined where ``inside`` (n,)."""
-    camera_points = camera.pose.rotation @ (points.T - camera.pose.position[:, None])
-    z = camera_points[2]
-    valid = inside & (z > 1e-9)
-    normalised = (
-        camera_points[:2] / z if valid.all() else np.where(valid, camera_points[:2] / np.where(valid, z, 1.0), 0.0)
-    )
-    lens = camera.intrinsics
-    distortion_jacobian = None
-    if lens.fisheye:
-        projected = lens.project_normalised(normalised.T).T
-        valid &= np.isfinite(projected).all(axis=0)
-    else:
-        distorted, distortion_jacobian = lens.distort(normalised.T)
-        projected = lens.matrix[:2, :2] @ distorted.T + lens.matrix[:2, 2:]
-        valid &= normalised[0] * normalised[0] + normalised[1] * normalised[1] < lens.fold**2
-    if not valid.all():
-        normalised = np.where(valid, normalised, 0.0)
-        projected = np.where(valid, projected, lens.matrix[:2, 2:])
-        if distortion_jacobian is not None:
-            distortion_jacobian[~valid] = np.eye(2)
+    camera_points, normalised, projected, distortion_jacobian, valid = _project(camera, points, inside)
     residual = projected - pixels.T
     return ResidualEvaluation(
         residual,
@@ -214,49 +196,85 @@ def evaluate_points(
     )
 
 
+def _project(camera: CameraState, points: Floats, inside: Bools) -> tuple[Floats, Floats, Floats, Floats | None, Bools]:
+    """What `kernels.project_points` gives; also by a fisheye lens, then without Jacobian."""
+    pose, lens = camera.pose, camera.intrinsics
+    if kernels.AVAILABLE and not lens.fisheye:
+        given = (pose.rotation, pose.position), (lens.matrix, lens.distortions, lens.fold)
+        return kernels.project_points(points, *given, inside)
+    camera_points = pose.rotation @ (points.T - pose.position[:, None])
+    z, jacobian = camera_points[2], None
+    valid = inside & (z > 0.0)
+    normalised = np.where(valid, camera_points[:2] / np.where(valid, z, 1.0), 0.0)
+    if lens.fisheye:
+        projected = lens.project_normalised(normalised.T).T
+        valid &= np.isfinite(projected).all(axis=0)
+    else:
+        valid &= (normalised**2).sum(axis=0) < lens.fold**2
+        distorted, rows_first = lens.distort(np.where(valid, normalised, 0.0).T)
+        projected, jacobian = lens.matrix[:2, :2] @ distorted.T + lens.matrix[:2, 2:], rows_first.transpose(1, 2, 0)
+    return (
+        camera_points,
+        np.where(valid, normalised, 0.0),
+        np.where(valid, projected, lens.matrix[:2, 2:]),
+        jacobian,
+        valid,
+    )
+
+
 def jacobians(evaluation: ResidualEvaluation, camera: CameraState, columns: Sequence[int]) -> Floats:
     """Jacobian (2, 3 + columns, n) of the residuals by the point and by the given camera parameter columns."""
-    out = np.empty((2, 3 + len(columns), len(evaluation.time)))
-    lens, normalised, camera_points = camera.intrinsics, evaluation.normalised, evaluation.camera_points
-    camera_point_jacobian = np.empty((2, 3, len(evaluation.time)))
-    inverse_depth = 1.0 / np.where(evaluation.valid, camera_points[2], 1.0)
-    matrix = lens.matrix[:2, :2]
-    if evaluation.distortion_jacobian is None:
-        camera_point_jacobian[:, :2] = lens.pixel_jacobian(normalised.T).transpose(1, 2, 0) * inverse_depth
+    out, velocity = np.empty((2, 3 + len(columns), len(evaluation.time))), None
+    if not {OFFSET, RATE, READOUT}.isdisjoint(columns):
+        velocity = weighted_sums(evaluation.control, evaluation.index, evaluation.slope_weights).T
+    place = np.array([3 + columns.index(k) if k in columns else -1 for k in range(OFFSET)])
+    if kernels.AVAILABLE and evaluation.distortion_jacobian is not None:
+        rows = evaluation.camera_points, evaluation.normalised, evaluation.distortion_jacobian, evaluation.valid
+        by_time = kernels.pose_jacobians(camera.pose.rotation, camera.intrinsics.matrix, rows, velocity, place, out)
     else:
-        distortion_jacobian = evaluation.distortion_jacobian.transpose(1, 2, 0) * inverse_depth
-        camera_point_jacobian[0, :2] = matrix[0, 0] * distortion_jacobian[0] + matrix[0, 1] * distortion_jacobian[1]
-        camera_point_jacobian[1, :2] = matrix[1, 0] * distortion_jacobian[0] + matrix[1, 1] * distortion_jacobian[1]
-    camera_point_jacobian[:, 2] = (
-        -camera_point_jacobian[:, 0] * normalised[0] - camera_point_jacobian[:, 1] * normalised[1]
-    )
-    point_jacobian = np.matmul(camera.pose.rotation.T, camera_point_jacobian, out=out[:, :3])
-    time_jacobian = radius2 = None
+        by_time = _pose_jacobians(evaluation, camera, velocity, place, out)
+    radius2 = None
     for column, values in zip(columns, out[:, 3:].transpose(1, 0, 2), strict=True):
-        if column < 3:  # a rotation by w moves the point by w × camera_points
-            i, j = (column + 1) % 3, (column + 2) % 3
-            np.subtract(
-                camera_points[i] * camera_point_jacobian[:, j],
-                camera_points[j] * camera_point_jacobian[:, i],
-                out=values,
-            )
-        elif column < OFFSET:
-            np.negative(point_jacobian[:, column - 3], out=values)
-        elif column in (OFFSET, RATE, READOUT):
-            if time_jacobian is None:
-                velocity = weighted_sums(evaluation.control, evaluation.index, evaluation.slope_weights).T
-                time_jacobian = (point_jacobian * velocity).sum(axis=1)
+        if column in (OFFSET, RATE, READOUT):
             factor: Floats | float = 1.0
             if column == RATE:
                 factor = evaluation.time - camera.centre
             elif column == READOUT:
                 factor = camera.rate * camera.row_offset(evaluation.pixels)
-            np.multiply(time_jacobian, factor, out=values)
-        else:
+            np.multiply(by_time, factor, out=values)
+        elif column > OFFSET:
             if radius2 is None:
-                radius2 = (normalised**2).sum(axis=0)
-            values[:] = _lens_jacobian(evaluation, lens, column, radius2)
+                radius2 = (evaluation.normalised**2).sum(axis=0)
+            values[:] = _lens_jacobian(evaluation, camera.intrinsics, column, radius2)
     return evaluation.whitened(out)
+
+
+def _pose_jacobians(
+    evaluation: ResidualEvaluation, camera: CameraState, velocity: Floats | None, place: Ints, out: Floats
+) -> Floats:
+    """What `kernels.pose_jacobians` does; also of a fisheye lens."""
+    normalised, camera_points, matrix = (
+        evaluation.normalised,
+        evaluation.camera_points,
+        camera.intrinsics.matrix[:2, :2],
+    )
+    distortion = evaluation.distortion_jacobian
+    bent = (
+        camera.intrinsics.pixel_jacobian(normalised.T).transpose(1, 2, 0)
+        if distortion is None
+        else np.tensordot(matrix, distortion, 1)
+    )
+    jacobian = np.empty((2, 3, len(evaluation.time)))
+    jacobian[:, :2] = bent / np.where(evaluation.valid, camera_points[2], 1.0)
+    jacobian[:, 2] = -jacobian[:, 0] * normalised[0] - jacobian[:, 1] * normalised[1]
+    by_point = np.matmul(camera.pose.rotation.T, jacobian, out=out[:, :3])
+    for k, column in enumerate(place):
+        if column >= 0 and k < 3:  # a rotation by w moves the point by w × camera_points
+            i, j = (k + 1) % 3, (k + 2) % 3
+            out[:, column] = camera_points[i] * jacobian[:, j] - camera_points[j] * jacobian[:, i]
+        elif column >= 0:
+            out[:, column] = -by_point[:, k - 3]
+    return np.zeros((2, 0)) if velocity is None else np.asarray((by_point * velocity).sum(axis=1))
 
 
 def _lens_jacobian(evaluation: ResidualEvaluation, lens: Intrinsics, column: int, radius2: Floats) -> Floats:

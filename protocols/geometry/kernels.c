@@ -12,6 +12,8 @@ typedef int64_t integer;
 
 #define SIXTH (1.0 / 6.0)
 
+enum { BLOCK = 64, MOST_COLUMNS = 9 };
+
 /* On processors with wider registers a loop takes fewer operations, with the same result. */
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && defined(__linux__)
 #define WIDE __attribute__((target_clones("avx2", "default")))
@@ -175,14 +177,83 @@ WIDE void brown_distortion(integer n, const double *normalised, const double *co
     }
 }
 
+/* Intrinsics.project and hub.bundle.residuals.evaluate_points: pixels (2, n) of world points (3, n) by a pinhole with
+   Brown's distortion; their camera_points (3, n), normalised (2, n), the Jacobian (2, 2, n) of distorted by normalised
+   coordinates. valid: (n,) where to look at all; on return also in front and within the fold. Elsewhere normalised = 0. */
+WIDE void project_points(integer n, const double *points, const double *rotation, const double *position,
+                         const double *matrix, const double *coefficients, double fold, double *camera_points,
+                         double *normalised, double *pixels, double *jacobian, uint8_t *valid)
+{
+    const double *r = rotation, *m = matrix;
+    double *px = pixels, *py = pixels + n;
+    for (integer i = 0; i < n; i++) {
+        double dx = points[i] - position[0], dy = points[n + i] - position[1], dz = points[2 * n + i] - position[2];
+        double cx = r[0] * dx + r[1] * dy + r[2] * dz, cy = r[3] * dx + r[4] * dy + r[5] * dz;
+        double cz = r[6] * dx + r[7] * dy + r[8] * dz, x = cx / cz, y = cy / cz;
+        int seen = (valid[i] != 0) & (cz > 0.0) & (x * x + y * y < fold * fold);
+        camera_points[i] = cx;
+        camera_points[n + i] = cy;
+        camera_points[2 * n + i] = cz;
+        normalised[i] = seen ? x : 0.0;
+        normalised[n + i] = seen ? y : 0.0;
+        valid[i] = (uint8_t)seen;
+    }
+    brown_distortion(n, normalised, coefficients, pixels, jacobian);
+    for (integer i = 0; i < n; i++) {
+        double x = px[i], y = py[i];
+        px[i] = m[0] * x + m[1] * y + m[2];
+        py[i] = m[3] * x + m[4] * y + m[5];
+    }
+}
+
+/* hub.bundle.residuals.jacobians: out (2, columns, n), by the point first; those of pose parameter k in column place[k],
+   unless negative. By time (2, n), from velocity (3, n), unless null. */
+WIDE void pose_jacobians(integer n, const double *rotation, const double *matrix, const double *camera_points,
+                         const double *normalised, const double *distortion, const uint8_t *valid,
+                         const double *velocity, const integer *place, integer columns, double *by_time, double *out)
+{
+    const double *r = rotation;
+    for (integer start = 0; start < n; start += BLOCK) {
+        const integer count = n - start < BLOCK ? n - start : BLOCK;
+        const double *at = camera_points + start, *flat = normalised + start, *bent = distortion + start;
+        for (integer row = 0; row < 2; row++) {
+            double by[3][BLOCK], *to = out + row * columns * n + start;
+            const double a = matrix[3 * row], b = matrix[3 * row + 1];
+            for (integer i = 0; i < count; i++) {
+                double near = 1.0 / (valid[start + i] ? at[2 * n + i] : 1.0);
+                by[0][i] = (a * bent[i] + b * bent[2 * n + i]) * near;
+                by[1][i] = (a * bent[n + i] + b * bent[3 * n + i]) * near;
+                by[2][i] = -by[0][i] * flat[i] - by[1][i] * flat[n + i];
+            }
+            for (integer k = 0; k < 3; k++) {
+                double *point = to + k * n;
+                for (integer i = 0; i < count; i++)
+                    point[i] = r[k] * by[0][i] + r[3 + k] * by[1][i] + r[6 + k] * by[2][i];
+            }
+            for (integer k = 0; k < 3; k++) {
+                const integer p = (k + 1) % 3, q = (k + 2) % 3;
+                double *turned = to + place[k] * n, *moved = to + place[3 + k] * n;
+                if (place[k] >= 0)  /* a rotation by w moves the point by w x camera_points */
+                    for (integer i = 0; i < count; i++) turned[i] = at[p * n + i] * by[q][i] - at[q * n + i] * by[p][i];
+                if (place[3 + k] >= 0)
+                    for (integer i = 0; i < count; i++) moved[i] = -to[k * n + i];
+            }
+            if (velocity) {
+                const double *v = velocity + start;
+                double *time = by_time + row * n + start;
+                for (integer i = 0; i < count; i++)
+                    time[i] = to[i] * v[i] + to[n + i] * v[n + i] + to[2 * n + i] * v[2 * n + i];
+            }
+        }
+    }
+}
+
 /* The tracks of one camera, a label each. rows: where each label's rows end. */
 typedef struct {
     integer labels;
     const integer *ends, *stretches, *sizes;
     const double *const *bases, *const *polynomials;
 } tracks_t;
-
-enum { BLOCK = 64, MOST_COLUMNS = 9 };
 
 /* hub.two_view.refinement: normal (k + 2, k + 2), gradient (k + 2,) and cost of Sampson distances with Cauchy weights,
    at the time map t_b = inverse_rate * centred_time + intercept. points: (2, n) of a; tracks: of b, whose polynomials

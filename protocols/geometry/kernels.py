@@ -24,6 +24,8 @@ _SIGNATURES = {
     "spline_normal": "npppnpnpdnpp",
     "add_rows": "nppnpppp",
     "brown_distortion": "npppp",
+    "project_points": "npppppdppppp",
+    "pose_jacobians": "nppppppppnpp",
     "refine_alignment": "nppppnndddnddndp",
     "smallest_eigenvalues": "npddndp",
     "neighbour_scores": "nppnpndp",
@@ -134,6 +136,47 @@ def brown_distortion(normalised: Floats, coefficients: Floats) -> tuple[Floats, 
     out, jacobian = np.empty(normalised.shape), np.empty((2, *normalised.shape))
     _library.brown_distortion(normalised.shape[1], _at(normalised), _at(coefficients), _at(out), _at(jacobian))
     return out, jacobian
+
+
+def project_points(
+    points: Floats, pose: tuple[Floats, Floats], lens: tuple[Floats, Floats, float], looked_at: Bools
+) -> tuple[Floats, Floats, Floats, Floats, Bools]:
+    """Of world points (n, 3): in camera axes (3, n), normalised (2, n), pixels (2, n), the Jacobian (2, 2, n) of Brown's
+    distortion, and whether they are in front of the camera and within the fold, of those ``looked_at`` (n,).
+
+    pose: rotation, position. lens: camera matrix, distortion, fold. Elsewhere the pixel is the principal point.
+    """
+    points, count = _rows_last(points), len(looked_at)
+    rotation, position, matrix, coefficients = (
+        np.ascontiguousarray(one, dtype=np.float64) for one in (*pose, *lens[:2])
+    )
+    seen, out, flat, pixels = looked_at.copy(), np.empty((3, count)), np.empty((2, count)), np.empty((2, count))
+    jacobian, given = np.empty((2, 2, count)), (_at(rotation), _at(position), _at(matrix), _at(coefficients), lens[2])
+    to = _at(out), _at(flat), _at(pixels), _at(jacobian), _at(seen)
+    _library.project_points(count, _at(points), *given, *to)
+    return out, flat, pixels, jacobian, seen
+
+
+def pose_jacobians(
+    rotation: Floats,
+    matrix: Floats,
+    rows: tuple[Floats, Floats, Floats, Bools],
+    velocity: Floats | None,
+    place: Ints,
+    out: Floats,
+) -> Floats:
+    """Into ``out`` (2, columns, n) the derivatives of pixels by the point and by pose parameter k in column place[k].
+
+    rows: camera_points, normalised, Jacobian and valid of `project_points`. velocity: (3, n) of the points. place: (6,),
+    -1 = not wanted. Returns the derivatives (2, n) by time, empty ones without velocity.
+    """
+    count, by_time = out.shape[2], np.empty((2, out.shape[2] if velocity is not None else 0))
+    rotation, matrix = (np.ascontiguousarray(one, dtype=np.float64) for one in (rotation, matrix))
+    kept = [np.ascontiguousarray(one) for one in (*rows, *([] if velocity is None else [velocity]))]
+    moving = 0 if velocity is None else _at(kept[4])
+    given = _at(rotation), _at(matrix), *(_at(one) for one in kept[:4]), moving, _at(place)
+    _library.pose_jacobians(count, *given, out.shape[1], _at(by_time), _at(out))
+    return by_time
 
 
 class SampledTracks:

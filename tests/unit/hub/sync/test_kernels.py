@@ -13,13 +13,16 @@ import pytest
 
 from hatch_build import FLAGS
 from hub.bundle.bordered_system import PathBlocks
+from hub.bundle.problem import OFFSET, READOUT, CameraState
+from hub.bundle.residuals import SplineSupport, evaluate_points, jacobians
 from hub.sync.lag_scan import smallest_eigenvalues
 from hub.sync.pair_solver import solve_pair
 from hub.trajectory.image_tracks import neighbour_test, smooth_track
 from hub.trajectory.splines import SplineBasis, fit_spline, weighted_sums
 from hub.two_view.relative_pose import homography_residual
-from protocols.geometry import kernels
+from protocols.geometry import kernels, so3
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.validation.layouts import Layouts
 from tests.bench.pair_trials import FOCAL, MATRIX, Regime, make_trial
@@ -134,6 +137,30 @@ def test_lenses_bend_alike(both: Both) -> None:
     normalised = np.random.default_rng(7).uniform(-0.5, 0.5, (50, 2))
     for part in (0, 1):
         np.testing.assert_allclose(*both(lambda part=part: lens.distort(normalised)[part]), rtol=1e-13, atol=1e-13)  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("bent", [[0.0] * 5, [-0.4, 0.05, 1e-3, -2e-3, 0.01]])
+def test_rows_are_projected_alike_with_all_derivatives(both: Both, bent: list[float]) -> None:
+    rng = np.random.default_rng(8)
+    lens = Intrinsics(800, 600, MATRIX + np.array([[0.0, 2.0, 0.0]] + [[0.0] * 3] * 2), np.array(bent))
+    pose = Pose(so3.exp(np.array([0.2, -0.1, 0.3])), np.array([0.5, -0.2, -4.0]))
+    points = rng.normal(size=(200, 3)) * np.array([3.0, 3.0, 4.0])  # some behind the camera or beyond the fold
+    points[5] = np.nan
+    control, index, weights = rng.normal(size=(24, 3)), rng.integers(0, 20, 200), rng.random((200, 4))
+    camera = CameraState(lens, pose, 1.0001, 0.3, 5.0, 0.01)
+
+    def rows() -> Floats:
+        support = SplineSupport(control, index, weights, weights[::-1].copy())
+        given = rng.random(200) < 2.0, np.linspace(0.0, 9.0, 200), np.full((200, 2), 300.0), support, np.ones(200)
+        found = evaluate_points(camera, points, *given)
+        by = jacobians(found, camera, [*range(10), READOUT]), jacobians(found, camera, [4, OFFSET])
+        every = *by, found.residual[None], found.normalised[None], found.camera_points[None]
+        return np.concatenate([found.valid, *(one[..., found.valid].ravel() for one in every)])
+
+    np.testing.assert_allclose(*both(rows), rtol=1e-10, atol=1e-10)
+    pixels = both(lambda: lens.project(points))
+    assert 20 < np.isnan(pixels[0][:, 0]).sum() < 150
+    np.testing.assert_allclose(*pixels, rtol=1e-12)
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
