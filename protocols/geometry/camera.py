@@ -14,7 +14,7 @@ import numpy as np
 from protocols.geometry import kernels
 from protocols.geometry.types import Floats
 
-_UNTURNED, _ORIGIN = np.eye(3), np.zeros(3)
+_IN_CAMERA_AXES = np.eye(3), np.zeros(3)
 _NEWTON_STEPS = 20  # a bound: it converges quadratically
 _NEWTON_TOLERANCE = 1e-12  # normalised: 1e-9 px
 _MAX_NORMALISED = 100.0  # in normalised coordinates: 89.4 degrees off the axis
@@ -76,8 +76,8 @@ class Intrinsics:
         if self.fisheye:
             return self._to_pixels(self._distort_fisheye(points))
         if kernels.AVAILABLE:
-            given = (_UNTURNED, _ORIGIN), (self.matrix, self.distortions, self.fold), np.ones(len(points), dtype=np.bool_)
-            _, _, pixels, _, seen = kernels.project_points(points, *given)
+            lens, every = (self.matrix, self.distortions, self.fold), np.ones(len(points), dtype=np.bool_)
+            _, _, pixels, _, seen = kernels.project_points(points, _IN_CAMERA_AXES, lens, every)
             pixels[:, ~seen] = np.nan
             return pixels.T
         z = points[:, 2]

@@ -141,8 +141,8 @@ def brown_distortion(normalised: Floats, coefficients: Floats) -> tuple[Floats, 
 def project_points(
     points: Floats, pose: tuple[Floats, Floats], lens: tuple[Floats, Floats, float], looked_at: Bools
 ) -> tuple[Floats, Floats, Floats, Floats, Bools]:
-    """Of world points (n, 3): in camera axes (3, n), normalised (2, n), pixels (2, n), the Jacobian (2, 2, n) of Brown's
-    distortion, and whether they are in front of the camera and within the fold, of those ``looked_at`` (n,).
+    """Of world points (n, 3): in camera axes (3, n), normalised (2, n), pixels (2, n), the Jacobian (2, 2, n) of
+    Brown's distortion, and which of those ``looked_at`` (n,) are in front of the camera and within the fold.
 
     pose: rotation, position. lens: camera matrix, distortion, fold. Elsewhere the pixel is the principal point.
     """
@@ -167,8 +167,8 @@ def pose_jacobians(
 ) -> Floats:
     """Into ``out`` (2, columns, n) the derivatives of pixels by the point and by pose parameter k in column place[k].
 
-    rows: camera_points, normalised, Jacobian and valid of `project_points`. velocity: (3, n) of the points. place: (6,),
-    -1 = not wanted. Returns the derivatives (2, n) by time, empty ones without velocity.
+    rows: camera_points, normalised, Jacobian and valid of `project_points`. velocity: (3, n) of the points. place:
+    (6,), -1 = not wanted. Returns the derivatives (2, n) by time, empty ones without velocity.
     """
     count, by_time = out.shape[2], np.empty((2, out.shape[2] if velocity is not None else 0))
     rotation, matrix = (np.ascontiguousarray(one, dtype=np.float64) for one in (rotation, matrix))

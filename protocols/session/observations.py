@@ -175,8 +175,7 @@ def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) 
         raise InputError("no rows", file=file, line=1, remedy="record some observations first")
     last = max(columns[name] for name in columns if name in used)
     for row, line in zip(rows, lines, strict=True):
-        if len(row) != len(header):
-            check_width(row, line, len(header), last, file)
+        check_width(row, line, len(header), last, file)
     numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
     far = np.flatnonzero(np.abs(numbers["time"]) > MAX_TIME_S)
     if len(far):
@@ -335,7 +334,7 @@ def check_columns(header: Sequence[str], required: Sequence[str], file: Path, op
 
 def check_width(row: Sequence[str], line: int, width: int, last: int, file: Path) -> None:
     """Raise InputError for a row without its column ``last``, or with cells beyond the ``width`` of the first line."""
-    if len(row) <= last or any(cell.strip() for cell in row[width:]):
+    if len(row) <= last or (len(row) > width and any(cell.strip() for cell in row[width:])):
         remedy = "complete the row" if len(row) <= last else "name every column; quote text with commas; decimal points"
         raise InputError(f"{len(row)} columns where the first line has {width}", file=file, line=line, remedy=remedy)
 
