@@ -892,3 +892,35 @@ void match_layouts(integer n, const integer *sizes, const unsigned char *payload
         for (; table && *table && !found[i]; table++) found[i] = (unsigned char)matches(payload, sizes[i], *table);
     }
 }
+
+enum { ORIENTATIONS = 9 };
+
+/* edge.uav.correlation.features: mean magnitude of each orientation (9, h / cell, w / cell) over square cells, each pixel
+   (h, w) shared by the two orientations beside its angle [rad]. Sums in OpenCV's order: the same bits as cv2.resize. */
+void orientation_cells(integer height, integer width, integer cell, const float *magnitude, const float *angle,
+                       float *out)
+{
+    const integer rows = height / cell, columns = width / cell, area = cell * cell;
+    const float per_radian = (float)(ORIENTATIONS / 3.14159265358979323846), share = 1.0f / (float)area;
+    for (integer row = 0; row < rows; row++)
+        for (integer column = 0; column < columns; column++) {
+            float sums[ORIENTATIONS] = {0.0f}, four[ORIENTATIONS] = {0.0f};
+            for (integer k = 0; k < area; k++) {
+                const integer at = (row * cell + k / cell) * width + column * cell + k % cell;
+                float place = angle[at] * per_radian;
+                if (place >= ORIENTATIONS) place -= ORIENTATIONS;
+                const integer low = (integer)place, next = low + 1 < ORIENTATIONS ? low + 1 : 0;
+                if (low < ORIENTATIONS) {
+                    four[low] += magnitude[at] * (1.0f - (place - (float)low));
+                    four[next] += magnitude[at] * (1.0f - ((float)(low + 1) - place));
+                } else
+                    four[0] += magnitude[at];
+                if (k % 4 == 3 || area - k <= area % 4)
+                    for (integer o = 0; o < ORIENTATIONS; o++) {
+                        sums[o] += four[o];
+                        four[o] = 0.0f;
+                    }
+            }
+            for (integer o = 0; o < ORIENTATIONS; o++) out[(o * rows + row) * columns + column] = sums[o] * share;
+        }
+}

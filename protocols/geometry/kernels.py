@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+import numpy.typing as npt
 
 from protocols.geometry.types import Bools, Floats, Ints
 
+Singles = npt.NDArray[np.float32]
 _KINDS = {"n": c_int64, "d": c_double, "p": c_void_p}
 _SIGNATURES = {
     "spline_weights": "npnpdpppp",
@@ -31,6 +33,7 @@ _SIGNATURES = {
     "neighbour_scores": "nppnpndp",
     "homography_residual": "nppnp",
     "match_layouts": "nppnpp",
+    "orientation_cells": "nnnppp",
 }
 """Of each function: counts n, doubles d and pointers p."""
 
@@ -52,7 +55,7 @@ _found = None if os.environ.get("SYNCLINE_PURE") else load(Path(__file__).with_n
 AVAILABLE, _library = _found is not None, cast(CDLL, _found)
 
 
-def _at(array: Floats | Ints | Bools) -> int:
+def _at(array: Floats | Ints | Bools | Singles) -> int:
     """The address of an array, which is contiguous and outlives the call."""
     try:
         return addressof(c_char.from_buffer(array))  # type: ignore[arg-type]  # a third of the time of numpy's own
@@ -252,3 +255,9 @@ def match_layouts(payloads: Sequence[bytes], tables: Ints) -> bytearray:
     to = addressof(c_char.from_buffer(found))
     _library.match_layouts(len(sizes), _at(sizes), b"".join(payloads), len(tables) - 1, _at(tables), to)
     return found
+
+
+def orientation_cells(magnitude: Singles, angle: Singles, cell: int, out: Singles) -> None:
+    """Into ``out`` (9, h / cell, w / cell) the means over cells of gradients (h, w) by orientation. angle: [rad]."""
+    height, width = magnitude.shape
+    _library.orientation_cells(height, width, cell, _at(magnitude), _at(angle), _at(out))

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.uav.base import Image
+from protocols.geometry import kernels
 
 Features = npt.NDArray[np.float32]
 
@@ -27,19 +28,14 @@ def cell_features(patch: Image, cell: int = 4) -> Features:
     size = (width // cell, height // cell)
     lab = cv2.cvtColor(patch, cv2.COLOR_BGR2LAB)
     lightness = cv2.extractChannel(lab, 0).astype(np.float32)
-    magnitude, angle = cv2.cartToPolar(
-        cv2.Sobel(lightness, cv2.CV_32F, 1, 0, ksize=1), cv2.Sobel(lightness, cv2.CV_32F, 0, 1, ksize=1)
-    )
-    at = angle * np.float32(ORIENTATIONS / np.pi)
-    at[at >= ORIENTATIONS] -= ORIENTATIONS
+    slopes = (cv2.Sobel(lightness, cv2.CV_32F, *axis, ksize=1) for axis in ((1, 0), (0, 1)))
+    magnitude, angle = (np.asarray(one, np.float32) for one in cv2.cartToPolar(*slopes))
     out = np.empty((CHANNELS, size[1], size[0]), np.float32)
-    for orientation in range(ORIENTATIONS):
-        away = np.abs(at - np.float32(orientation))
-        if orientation == 0:
-            away = np.minimum(away, ORIENTATIONS - away)
-        share = np.maximum(np.float32(1.0) - away, np.float32(0.0))
-        out[orientation] = cv2.resize(magnitude * share, size, interpolation=cv2.INTER_AREA)
     histogram = out[:ORIENTATIONS]
+    if kernels.AVAILABLE and (height % cell, width % cell) == (0, 0):
+        kernels.orientation_cells(magnitude, angle, cell, histogram)
+    else:
+        _orientation_cells(magnitude, angle, size, histogram)
     energy = cv2.boxFilter(np.square(histogram).sum(axis=0), -1, (3, 3))
     histogram /= np.sqrt(energy + np.float32(_NOISE_LEVEL**2))
     np.minimum(histogram, np.float32(_CLIP), out=histogram)
@@ -47,3 +43,15 @@ def cell_features(patch: Image, cell: int = 4) -> Features:
     small = cv2.resize(lab, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     out[ORIENTATIONS:] = (np.moveaxis(small, 2, 0) - np.float32(128.0)) * np.float32(_COLOUR_GAIN)
     return out
+
+
+def _orientation_cells(magnitude: Features, angle: Features, size: tuple[int, int], out: Features) -> None:
+    """Into ``out`` (9, rows, columns) the means over cells of gradients (h, w) by orientation. size: columns, rows."""
+    at = angle * np.float32(ORIENTATIONS / np.pi)
+    at[at >= ORIENTATIONS] -= ORIENTATIONS
+    for orientation in range(ORIENTATIONS):
+        away = np.abs(at - np.float32(orientation))
+        if orientation == 0:
+            away = np.minimum(away, ORIENTATIONS - away)
+        share = np.maximum(np.float32(1.0) - away, np.float32(0.0))
+        out[orientation] = cv2.resize(magnitude * share, size, interpolation=cv2.INTER_AREA)

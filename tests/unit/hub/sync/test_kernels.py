@@ -8,9 +8,11 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from edge.uav.correlation.features import cell_features
 from hatch_build import FLAGS
 from hub.bundle.bordered_system import PathBlocks
 from hub.bundle.problem import OFFSET, READOUT, CameraState
@@ -161,6 +163,12 @@ def test_rows_are_projected_alike_with_all_derivatives(both: Both, bent: list[fl
     pixels = both(lambda: lens.project(points))
     assert 20 < np.isnan(pixels[0][:, 0]).sum() < 150
     np.testing.assert_allclose(*pixels, rtol=1e-12)
+
+
+@pytest.mark.parametrize("cell", [4, 5, 6])
+def test_cells_have_the_same_orientations(both: Both, cell: int) -> None:
+    patch = cv2.GaussianBlur(np.random.default_rng(9).integers(0, 256, (60, 120, 3), dtype=np.uint8), (5, 5), 1.5)
+    np.testing.assert_array_equal(*both(lambda: cell_features(np.asarray(patch, np.uint8), cell)))
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
