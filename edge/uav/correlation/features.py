@@ -28,8 +28,8 @@ def cell_features(patch: Image, cell: int = 4) -> Features:
     size = (width // cell, height // cell)
     lab = cv2.cvtColor(patch, cv2.COLOR_BGR2LAB)
     lightness = cv2.extractChannel(lab, 0).astype(np.float32)
-    slopes = (cv2.Sobel(lightness, cv2.CV_32F, *axis, ksize=1) for axis in ((1, 0), (0, 1)))
-    magnitude, angle = (np.asarray(one, np.float32) for one in cv2.cartToPolar(*slopes))
+    across, down = (cv2.Sobel(lightness, cv2.CV_32F, *axis, ksize=1) for axis in ((1, 0), (0, 1)))
+    magnitude, angle = (np.asarray(one, np.float32) for one in cv2.cartToPolar(across, down))
     out = np.empty((CHANNELS, size[1], size[0]), np.float32)
     histogram = out[:ORIENTATIONS]
     if kernels.AVAILABLE and (height % cell, width % cell) == (0, 0):
