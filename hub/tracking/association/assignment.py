@@ -9,7 +9,7 @@ from scipy.optimize import linear_sum_assignment
 
 from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter import kalman
-from hub.tracking.filter.kalman import LOG_SIZE, STATE_DIM
+from hub.tracking.filter.kalman import LOG_SIZE
 from hub.tracking.filter.measurement import (
     FOOT,
     HEAD,
@@ -77,9 +77,9 @@ def association_scores(
     value, noise: (m, 7), (m, 7, 7) measurements of the frame. names: labels of the targets. colour_std: of a channel.
     fixed: (n,) a detection whose distance is wanted whether it is inside the gate or not, -1 = none.
     """
-    jacobian = predicted.jacobian[:, :LOG_IMAGE_SIZE].reshape(len(targets), 3, 2, STATE_DIM)
-    own = jacobian @ targets.covariance[:, None] @ jacobian.swapaxes(2, 3) + _blocks(predicted.model_noise)
-    other, off = _blocks(noise), value[None, :, POINT] - predicted.value[:, None, POINT]
+    spread = predicted.jacobian @ targets.covariance @ predicted.jacobian.swapaxes(1, 2)
+    own, other = _blocks(spread + predicted.model_noise), _blocks(noise)
+    off = value[None, :, POINT] - predicted.value[:, None, POINT]
     distance = np.full((len(targets), len(frame), 3), np.nan)
     distance[:, :, 0] = _squared_distance(own[:, None, 0], other[:, 0], off)
     log_ratio = np.full(distance.shape[:2], -np.inf)
@@ -94,10 +94,9 @@ def association_scores(
     selected = predicted.select(row)
     used = gated_rows(value[column], selected, distance[row, column], targets.covariance[row])
     innovation = np.where(used, value[column] - selected.value, 0.0)
-    total = matched_noise(noise[column], selected, distance[row, column])
-    log_likelihood = -0.5 * kalman.minus_two_log_likelihood(
-        targets.covariance[row], innovation, selected.jacobian, total, used
-    ) - 0.5 * np.log(2.0 * np.pi) * used.sum(axis=1)
+    total = spread[row] + matched_noise(noise[column], selected, distance[row, column])
+    squared, log_determinant = kalman.fit(innovation, total, used)
+    log_likelihood = -0.5 * (squared + log_determinant + np.log(2.0 * np.pi) * used.sum(axis=1))
     log_likelihood -= _log_clutter(frame, column, used, np.isfinite(value[column]))
     log_ratio[row, column] = np.where(distance[row, column, 0] < POINT_GATE, log_likelihood, -np.inf)
     if np.isfinite(frame.colour).any():
@@ -203,6 +202,8 @@ def gated_rows(value: Floats, predicted: PredictedMeasurement, distance: Floats,
     used = np.isfinite(value) & np.isfinite(predicted.value)
     for part, rows in ((1, HEAD), (2, FOOT)):
         used[:, rows] &= (distance[:, part] < PART_GATE)[:, None]
+    if not used[:, LOG_IMAGE_SIZE].any():
+        return used
     jacobian = predicted.jacobian[:, LOG_IMAGE_SIZE]
     spread = (
         np.einsum("ni,nij,nj->n", jacobian, covariance, jacobian)
