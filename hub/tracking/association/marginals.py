@@ -26,4 +26,4 @@ def marginal_probabilities(ratio: Floats) -> tuple[Floats, Floats]:
     to_detection = pair / (1.0 + (np.bincount(row, weighted, n)[row] - weighted))
     probability = np.zeros((n, m))
     probability[row, column] = weighted / (1.0 + np.bincount(row, weighted, n)[row])
-    return probability, 1.0 / (1.0 + np.bincount(column, to_detection, m))
+    return probability, np.asarray(1.0 / (1.0 + np.bincount(column, to_detection, m)))

@@ -30,8 +30,7 @@ _ALONG_UNKNOWN = np.array([0.0, 0.5, -0.5])
 """Of point, head and foot above the centre, in sizes; the second where the vertical is unknown."""
 _POINTS_VARIANCE = np.array(
     [
-        model.common_std**2
-        + np.kron(np.diag([model.point_std, model.head_std, model.foot_std]) ** 2, np.ones((2, 2)))
+        model.common_std**2 + np.kron(np.diag([model.point_std, model.head_std, model.foot_std]) ** 2, np.ones((2, 2)))
         for model in TARGET_MODELS
     ]
 )
