@@ -263,7 +263,7 @@ def _update_associated(
     mean, covariance = targets.mean[row], targets.covariance[row]
     measurement = innovation, selected.jacobian, total, used
     if manoeuvre is None:
-        mean, covariance, nis, _ = kalman.update_and_fit(mean, covariance, *measurement)
+        mean, covariance, nis, _ = kalman.update(mean, covariance, *measurement)
     else:
         mean, covariance, nis = gpb1_update(
             mean, covariance, manoeuvre.covariance[row], manoeuvre.prior_odds[row], *measurement

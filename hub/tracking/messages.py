@@ -150,9 +150,7 @@ def _predict(
         seen &= (np.abs(pixels) <= _MAX_PIXEL).all(axis=1)
     size, face = np.linalg.norm(heads - feet, axis=1), face_regions(heads, feet)
     views = head_views(targets.mean, ahead, camera, parameters)
-    spread = np.stack(
-        [covariance[:, 0, 0], 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0]), covariance[:, 1, 1]], axis=1
-    )
+    spread = (0.5 * (covariance + covariance.swapaxes(1, 2))).reshape(-1, 4)[:, [0, 1, 3]]
     numbers = np.hstack([pixels, speed, spread, heads, feet, size[:, None], face])[seen].tolist()
     for i, row in zip(np.flatnonzero(seen).tolist(), numbers, strict=True):
         kind = int(targets.kind[i])

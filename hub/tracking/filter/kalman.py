@@ -45,13 +45,6 @@ def predict(
 
 def update(
     mean: Floats, covariance: Floats, innovation: Floats, jacobian: Floats, noise: Floats, used: Bools
-) -> tuple[Floats, Floats]:
-    """Kalman update of each state with one measurement; arguments as in `update_and_fit`."""
-    return update_and_fit(mean, covariance, innovation, jacobian, noise, used)[:2]
-
-
-def update_and_fit(
-    mean: Floats, covariance: Floats, innovation: Floats, jacobian: Floats, noise: Floats, used: Bools
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Kalman update of each state with one measurement, and what `fit` says of the measurements.
 

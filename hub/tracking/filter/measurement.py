@@ -26,8 +26,7 @@ _STUDENT_T_DOF = 4.0
 
 _UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 _ALONG = np.array([(model.point_offset, 0.5, -0.5) for model in TARGET_MODELS])
-_ALONG_UNKNOWN = np.array([0.0, 0.5, -0.5])
-"""Of point, head and foot above the centre, in sizes; the second where the vertical is unknown."""
+"""Of point, head and foot above the centre, in sizes."""
 _POINTS_VARIANCE = np.array(
     [
         model.common_std**2 + np.kron(np.diag([model.point_std, model.head_std, model.foot_std]) ** 2, np.ones((2, 2)))
@@ -74,7 +73,7 @@ def predict_measurement(camera: TrackingCamera, mean: Floats, kind: Ints, up: Fl
     centre = (mean[:, POSITION] - camera.pose.position) @ rotation.T
     depth = centre[:, 2]
     # The three points of every target at once: (n, 3, ...) of point, head, foot.
-    along = size[:, None] * np.where(upright[:, None], _ALONG[kind], _ALONG_UNKNOWN)
+    along = size[:, None] * _ALONG[kind]
     where = centre[:, None] + along[:, :, None] * axis
     good = where[:, :, 2] > _MIN_DEPTH * size[:, None]
     good[:, 1:] &= upright[:, None]
