@@ -67,6 +67,18 @@ def test_correlated_errors_are_no_wander() -> None:
     assert not [text for text in found.warnings if "rate changes" in text]
 
 
+@pytest.mark.parametrize("seed", [2, 12])
+def test_a_path_extrapolated_where_one_camera_sees_the_target_is_no_wander(seed: int) -> None:
+    session, random = rigs.simulate(seed, 2, 60.0, noise=2.0), np.random.default_rng(seed)
+    keep, camera = np.ones(len(session.time), dtype=np.bool_), np.array(session.camera)
+    for name in session.rig.cameras:  # out of view half of the time, two seconds each on average
+        time = session.time[camera == name]
+        keep[camera == name] = np.searchsorted(np.cumsum(random.exponential(2.0, 99)), time - time.min()) % 2 == 0
+    found = calibrate(session.rig, session.observations(np.flatnonzero(keep)))
+    assert not [text for text in found.warnings if "rate changes" in text]
+    assert abs(session.clock_error("cam1", "cam0", found.cameras["cam1"].time_map)) < 4e-3
+
+
 @pytest.mark.parametrize("slewed", ["cam0", "cam2"])
 def test_a_clock_that_is_slewed_live_is_followed_also_as_the_reference(slewed: str) -> None:
     session = rigs.simulate(60, 5, 45.0)
