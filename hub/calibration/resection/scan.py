@@ -428,14 +428,14 @@ def _best_and_next(verified: list[_Verified]) -> tuple[_Verified, float]:
 def resected_residuals(positions: Floats, seen: Floats, others: Floats, others_seen: Floats, focal: float) -> Floats:
     """Residuals [px] of ``others`` under the pose that fits ``positions`` best; inf behind the camera.
 
-    Where most of the points are not explained, the pose is fitted again to the better half: a few false detections far
-    off displace a pose by more than the right one's residuals.
+    Where not all points are explained, the pose is fitted again to the better half: one false detection in twenty, far
+    off and always in one place, displaces a pose by 7 to 17 px.
     """
     pose = resect(positions, seen)
     for _ in range(_TRIMS):
         residual = _reprojection(pose, positions, seen, focal)
         typical = float(np.median(residual))
-        if typical < TRUNCATION_PX or not np.isfinite(typical):
+        if float(residual.max()) < TRUNCATION_PX or not np.isfinite(typical):
             break
         pose = resect(positions[residual <= typical], seen[residual <= typical])
     return _reprojection(pose, others, others_seen, focal)
