@@ -203,12 +203,13 @@ def find_time_map(
 
 
 def seen_labels(camera: CameraInput, reconstruction: Reconstruction) -> list[SeenLabel]:
-    """The labels of a camera whose path the others give."""
+    """The labels of a camera whose path two others give: where it and one other see it, the path follows both."""
+    own = reconstruction.names.index(camera.name) if camera.name in reconstruction.names else None
     return [
         SeenLabel(track, reconstruction.state.trajectories[i], observed)
         for i, label in enumerate(reconstruction.labels)
         if isinstance(track := camera.tracks.get(label), SmoothTrack)
-        for observed in [observation_times(reconstruction.problem, reconstruction.state, i)]
+        for observed in [observation_times(reconstruction.problem, reconstruction.state, i, own)]
     ]
 
 
