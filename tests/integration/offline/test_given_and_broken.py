@@ -403,6 +403,18 @@ def test_known_cameras_in_one_place_are_refused_in_one_line(four: tuple[rigs.Ses
         triangulate(session.rig, cameras, session.observations())
 
 
+def test_with_known_poses_motion_in_a_plane_gives_the_lags() -> None:
+    path = rigs.random_path(np.random.default_rng(8))
+    session = rigs.simulate(7, 3, 20.0, path=path)
+    known = FixedCalibration(dict(calibrate(session.rig, session.observations()).cameras), "arbitrary")
+    flat = rigs.simulate(7, 3, 20.0, path=replace(path, amplitude=path.amplitude * [1.0, 1.0, 0.0]))
+    found = calibrate(flat.rig, flat.observations(), known=known)
+    for name in ("cam1", "cam2"):
+        assert abs(flat.clock_error(name, "cam0", found.cameras[name].time_map)) < 2e-3
+    with pytest.raises(Refused, match="in one plane"):
+        calibrate(flat.rig, flat.observations())
+
+
 @pytest.mark.parametrize("gap", [0.0, 1e-3])
 def test_exact_poses_of_two_cameras_in_one_place_are_no_fault(monkeypatch: pytest.MonkeyPatch, gap: float) -> None:
     """In the datum of their baseline all else was uncertain, and true references 1 mm apart were called wrong."""
