@@ -166,7 +166,7 @@ def _hat_matrix_trace(
         own = np.flatnonzero(parameters // CAMERA_PARAMETERS == rows.camera)
         shift[:, :, own] += root * line.camera_jacobian[:, :, parameters[own] % CAMERA_PARAMETERS]
         shift = shift.reshape(-1, len(seeing))
-        leverage += (shift @ found.free.submatrix(seeing) * shift).sum(axis=(1, 2))
+        leverage += (shift @ found.free.submatrix(seeing) * shift).reshape(len(pick), -1).sum(axis=1)
     # A coordinate has 1 at most; where a path passes through the camera's plane, rounding made it thousands.
     return float(np.minimum(leverage, 2.0).sum()) * len(used) / len(pick)
 
