@@ -35,7 +35,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Ints
 
 _SAMPLE_SIZE = pf.KldSampleSize(cell=(0.6, 0.6), error=0.05, confidence=0.99, min_count=150, max_count=500)
-_INITIAL_COUNT = 400
+_INITIAL_COUNT = 400  # between the bounds of the sample size, which is computed from the next frame on
 _VELOCITY_GAIN = 0.35  # of the nudging towards the motion fit, per frame
 _POSITION_GAIN = 0.2  # the same for the position
 _MIN_ALIGN_DISTANCE = 0.6  # distance travelled before the heading is used, in target lengths

@@ -13,7 +13,7 @@ from protocols.geometry.types import Bools, Floats
 
 Bins = npt.NDArray[np.uint8]
 
-HUES, SATURATIONS = 12, 4
+HUES, SATURATIONS = 12, 4  # bins: more tell similar colours apart, fewer bear other light
 BINS = 1 + HUES * SATURATIONS
 SHARPNESS = 20.0
 """lambda of eq. (2.8); the paper gives no value."""

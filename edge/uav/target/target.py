@@ -18,7 +18,7 @@ from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
 
-_LEARNING_RATE = 0.04
+_LEARNING_RATE = 0.04  # of a frame: a mean over 25, in which one wrong patch hardly shows
 _CENTRE_HEIGHT_RATIO = 0.155  # height of a car's centre over its length
 _RELEARN_SHARE = 0.12  # increase of the visible share at which the appearance is learnt again
 _FULL_SHARE = 0.97  # visible share that counts as complete

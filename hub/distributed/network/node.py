@@ -65,7 +65,7 @@ _TIMEOUT_UPDATES = 20
 """Updates without a message after which a neighbour no longer reduces the step."""
 _CONVERGED_CHI2, _CONVERGED_UPDATES = 9.0, 5
 """Largest predicted chi2 decrease of a step, and for how many successive updates, for the moved-camera test."""
-_CONTRADICTION_COST = 60.0
+_CONTRADICTION_COST = 60.0  # half chi2 of six numbers: 4.5 stds on each, never by chance
 _MAX_CONTRADICTIONS = 30  # in succession, before the pose is started anew
 
 
