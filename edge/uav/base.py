@@ -17,6 +17,7 @@ import numpy.typing as npt
 from protocols.geometry.types import Floats
 
 Image = npt.NDArray[np.uint8]
+LOST_STD, LOST_AFTER_S = 8.0, 15.0  # std in target lengths, time unseen: beyond, an estimate is of no use
 
 
 class TrackState(StrEnum):

@@ -13,12 +13,12 @@ from google.protobuf.message import Message
 
 from hub.distributed.merge import merge_calibrations
 from hub.distributed.sharding import OverlapMeter, Pairs, border, split
-from hub.live.budgets import MAX_CAMERAS
 from hub.live.live_hub import LiveHub, merge_rigs
 from hub.live.messages import calibration_from_message, calibration_message
 from hub.tracking.detections import tracked_kind
 from hub.tracking.handover import TrackHandover
 from protocols.core.errors import Refused
+from protocols.core.ranges import MAX_CAMERAS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import rig_camera_from_info
 from protocols.session.calibration import Calibration

@@ -15,6 +15,7 @@ from typing import Any
 from protocols.core.errors import InputError
 from protocols.core.names import check_identifier, is_name
 from protocols.core.ranges import (
+    MAX_CAMERAS,
     MAX_CLOCK_RATE,
     MAX_COUNT,
     MAX_DISTORTION,
@@ -36,7 +37,6 @@ from protocols.messages import syncline_pb2 as pb
 SCHEMA_VERSION = 1  # of the messages
 
 MAX_DETECTIONS = 4096  # of one frame
-MAX_CAMERAS = 1024  # of a hub
 MAX_OVERLAPS = 12 * MAX_CAMERAS  # of each camera as many as a calibration takes pairs
 MAX_NUMBERS = 256  # of one list
 MAX_LABEL = 64  # characters

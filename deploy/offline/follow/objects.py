@@ -21,6 +21,7 @@ import numpy as np
 from deploy.offline.csv_table import CsvTable, read_csv_header, read_csv_table
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
+from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.detections import DetectionRows, read_detections
@@ -28,7 +29,6 @@ from protocols.session.detections import DetectionRows, read_detections
 Kind = Literal["person", "vehicle"]
 BOXES_FILE = "boxes.csv"
 _BOX_COLUMNS = ("camera", "frame", "time", "x", "y", "width", "height")
-_MAX_PIXEL = 1e6  # far outside every image
 _MAX_TIME_S = 9e9
 """Beyond it a time [s] does not fit into 64 bits of nanoseconds."""
 _MAX_EMPTY_PER_FRAME = 20
@@ -89,7 +89,7 @@ def _flat(box: Floats, wrong: str, row: int) -> str:
 
 
 def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> DetectionRows:
-    box = np.column_stack([table.numbers(name, _MAX_PIXEL) for name in ("x", "y", "width", "height")])
+    box = np.column_stack([table.numbers(name, MAX_PIXEL) for name in ("x", "y", "width", "height")])
     for side, wrong in ((3, "its foot is not below its head"), (2, "its right side is not right of its left")):
         table.refuse(box[:, side] <= 0.0, partial(_flat, box, wrong))
     limit = np.array([sizes[name] for name in table.columns["camera"]], dtype=np.float64)

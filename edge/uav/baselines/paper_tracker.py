@@ -17,7 +17,7 @@ from edge.uav.base import Box, Estimate, Hypothesis, Image, Telemetry, TrackStat
 from edge.uav.baselines import histograms, regions
 from edge.uav.baselines.background import BackgroundFilter, BackgroundMotion
 from edge.uav.baselines.car_models import BackgroundAwareModel, FrameObservation, RoadSteeredModel
-from edge.uav.baselines.plain_tracker import AppearanceTest
+from edge.uav.baselines.plain_tracker import MIN_VISIBLE_SHARE, AppearanceTest
 from edge.uav.baselines.road import RoadCourse, RoadMidline, extrapolated_course
 from edge.uav.baselines.road_filter import RoadFilter, line_support
 from edge.uav.baselines.white_lines import EdgeDistance, find_sections
@@ -28,11 +28,10 @@ from protocols.geometry.types import Floats
 
 _MAX_INITIAL_SPEED = 0.3  # of the box's longer side, per frame
 _SPEED_NOISE = 0.004  # of the box's longer side, a frame
-_FIRST_PARTICLES = 600
-_MIN_PARTICLES, _MAX_PARTICLES = 300, 800
+_FIRST_PARTICLES = 600  # of the first frame, in which speed and heading are unknown
+_MIN_PARTICLES, _MAX_PARTICLES = 300, 800  # of the KLD sample size: fewer lose another road, more cost CPU
 _EXTRAPOLATION = 0.8  # image diagonals: length of the road extrapolation
 _COURSE_STEP = 6.0  # px
-_MIN_VISIBLE_SHARE = 0.5  # of the box that must lie in the image to be called visible
 _LOST_SPREAD = 0.35  # image diagonals: with a larger std of the particles the target is lost
 _DIRECTION_UPDATE_RATE = 0.15  # per frame
 _MIN_MARKED_SHARE = 0.6  # share of the visible road with white lines; below it the target may be on another road
@@ -184,7 +183,7 @@ class PaperTracker:
         track.visible = False
         if (
             observation.image is not None
-            and visible_share(position[0], position[1], track.box, self.size) >= _MIN_VISIBLE_SHARE
+            and visible_share(position[0], position[1], track.box, self.size) >= MIN_VISIBLE_SHARE
         ):
             similarity = histograms.visible_similarity(observation.image, position[None], track.box, track.template)[0]
             track.visible = track.appearance_test.accepts(float(similarity))
