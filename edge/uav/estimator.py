@@ -15,7 +15,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from edge.uav import tracker_factory
-from edge.uav.base import Box, Estimate, Image, Telemetry, Tracker, TrackState
+from edge.uav.base import Box, Estimate, Telemetry, Tracker, TrackState
 from edge.uav.georeference import Georeference
 from edge.uav.navigation import Origin, rotation_from_quaternion
 from protocols.core.clocks import NANOSECONDS
@@ -23,7 +23,7 @@ from protocols.core.errors import InputError
 from protocols.core.jpeg import decode_jpeg
 from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 from protocols.messages import syncline_pb2 as pb
 from protocols.validation.codec import SCHEMA_VERSION
 

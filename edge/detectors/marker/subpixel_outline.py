@@ -13,12 +13,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.detectors.marker.static_background import is_known
-from protocols.geometry.types import Bools, Floats
-
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Bools, Floats, Image
 
 _RAYS = 48  # across the outline, evenly spaced
 _MIN_SAMPLES = 20  # samples of the ball alone

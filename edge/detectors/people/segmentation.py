@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.detectors.people.height_model import HeightModel
 from edge.detectors.people.occupancy import fit_templates
@@ -25,9 +24,8 @@ from edge.detectors.people.silhouettes import (
     segment_by_shape,
 )
 from edge.detectors.people.templates import BACKGROUND_WEIGHT, Box, SilhouetteRegion, Template, template_mask
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image
 
-Image = npt.NDArray[np.uint8]
 _SHADOW_WEIGHT = -0.08  # log-likelihood ratio of body to background at shadow pixels, relative to a silhouette pixel
 _BREADTH = 0.36  # breadth of a person's box over the height
 _MAX_PIXEL_DISTANCE = 0.33  # over the height: largest distance of a pixel from its person's centre

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge.devices.base import DeviceInfo, Frame, Image
+from edge.devices.base import DeviceInfo, Frame
 from edge.devices.playback.playback_clock import PlaybackClock, wait_until
 from edge.devices.simulated.aircraft import SimulatedAircraft
 from edge.uav.world.flight_world import FlightWorld
 from protocols.core.clocks import NANOSECONDS
+from protocols.geometry.types import Image
 
 _TRANSFER_S = 0.004  # from mid-exposure to the host
 

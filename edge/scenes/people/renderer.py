@@ -18,12 +18,11 @@ from edge.scenes.common.base import Renderer
 from edge.scenes.common.sensor import PEDESTAL, SensorNoise, pixel_rays, subtract_pedestal
 from edge.scenes.people.scene import RADII, Person, joint_radii
 from edge.scenes.people.walking import JOINTS
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 if TYPE_CHECKING:
     from edge.scenes.people.scene import PeopleScene
 
-Image = npt.NDArray[np.uint8]
 _BACKGROUND_STREAM = 2  # of the random numbers, apart from those of people and noise
 _NOISE_STD = 3.0  # 8-bit steps, of a small sensor indoors
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates

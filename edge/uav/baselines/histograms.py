@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Box, Image
-from protocols.geometry.types import Bools, Floats
+from edge.uav.base import Box
+from protocols.geometry.types import Bools, Floats, Image
 
 Bins = npt.NDArray[np.uint8]
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Box, Estimate, Hypothesis, Image, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Hypothesis, Telemetry, TrackState
 from edge.uav.baselines import histograms, regions
 from edge.uav.baselines.background import BackgroundFilter, BackgroundMotion
 from edge.uav.baselines.car_models import BackgroundAwareModel, FrameObservation, RoadSteeredModel
@@ -24,7 +24,7 @@ from edge.uav.baselines.white_lines import EdgeDistance, find_sections
 from edge.uav.prediction import particle_filter as pf
 from edge.uav.target.box import check_target_box, has_frame_format, visible_share
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _MAX_INITIAL_SPEED = 0.3  # of the box's longer side, per frame
 _SPEED_NOISE = 0.004  # of the box's longer side, a frame

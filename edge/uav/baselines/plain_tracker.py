@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Telemetry, TrackState
 from edge.uav.baselines import histograms
 from edge.uav.prediction import particle_filter as pf
 from edge.uav.target.box import check_target_box, has_frame_format, visible_share
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _MAX_INITIAL_SPEED = 0.25  # of the box's longer side, per frame
 _SPEED_NOISE = 0.03  # of the box's longer side, a frame

@@ -12,7 +12,7 @@ from copy import copy
 
 import numpy as np
 
-from edge.uav.base import LOST_AFTER_S, LOST_STD, Box, Estimate, Image, TrackState
+from edge.uav.base import LOST_AFTER_S, LOST_STD, Box, Estimate, TrackState
 from edge.uav.correlation.belief import Belief
 from edge.uav.correlation.candidate import Kinematics
 from edge.uav.correlation.colour import ColourModel
@@ -29,7 +29,7 @@ from edge.uav.image_motion.median_background import MedianBackground
 from edge.uav.image_motion.residual import MovingParts
 from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
 from edge.uav.target.box import check_target_box
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _LEARN_INSIDE = 0.97  # share of the box in the image above which appearance and velocity are learnt
 _SIZE_INSIDE = 0.85  # and above which the flow in it measures its size

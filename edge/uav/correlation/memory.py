@@ -14,10 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from edge.uav.base import Image
 from edge.uav.correlation.features import Features, cell_features
 from edge.uav.correlation.oriented_box import OrientedBox, crop
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 CELLS, CELL_PX = 6, 4  # along a side; along a cell: finer cells need a more exact place, coarser ones look alike
 SIDE = CELLS * CELL_PX

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.base import Image
 from edge.uav.correlation.candidate import KEEPS, MAX_TESTS, Candidate, Kinematics
 from edge.uav.correlation.colour import ColourModel
 from edge.uav.correlation.filter import Response
@@ -16,7 +15,7 @@ from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.correlation.search import Found, search, tile
 from edge.uav.image_motion.residual import UNKNOWN, Residual
 from edge.uav.image_motion.scene_motion import Motion
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _MARGIN = 1.0  # log odds by which a place must exceed the next best one, and the one under test
 _MANOEUVRE = 3.0  # acceleration of what brakes, turns or sets off, in lengths a second squared; a car that starts

@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Image
 from edge.uav.correlation.features import cell_features
 from edge.uav.correlation.filter import refined
 from edge.uav.correlation.oriented_box import OrientedBox, crop
 from edge.uav.image_motion.scene_motion import middle
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _FLOW_PX = 72  # longer side of the resampled box [px]
 _FLOW_GRID = 7  # points a side

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Floats, Image
 
 _MAX_LOG_CHANGE = 0.3  # of the gain, per frame
 _LEAK = 0.99  # of the log gain, per frame

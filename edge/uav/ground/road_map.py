@@ -7,10 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
-Singles = npt.NDArray[np.float32]
+from protocols.geometry.types import Floats, Image, Singles
 
 CELL = 0.5
 """Size of a cell [ground units]."""

@@ -14,11 +14,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Image
 from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.ground.ego_motion import LK_WINDOW
 from edge.uav.ground.photometric import PhotometricGain
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image
 
 Gray = npt.NDArray[np.uint8]
 

@@ -14,10 +14,7 @@ import numpy.typing as npt
 
 from edge.uav.correlation.filter import refined
 from edge.uav.ground.image_plane import ImagePlane, apply_homography
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
-Singles = npt.NDArray[np.float32]
+from protocols.geometry.types import Floats, Image, Singles
 
 _BITS = 5  # per colour channel in the table
 _BINS = 1 << _BITS

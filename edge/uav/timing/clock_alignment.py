@@ -10,11 +10,11 @@ from collections import deque
 
 import numpy as np
 
-from edge.uav.base import Image, Telemetry
+from edge.uav.base import Telemetry
 from edge.uav.timing.telemetry_offset import OffsetEstimate, find_offset
 from edge.uav.timing.visual_rotation import VisualRotationEstimator
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _DELAY_BUFFER = 900  # frames: half a minute at 30 fps, of which one arrives with little delay
 _SEARCH_HALF_WIDTH_S = 0.7  # wider than telemetry_track's MAX_OFFSET_S: a maximum at the window's end is refused

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from edge.uav.base import Image, Telemetry
+from edge.uav.base import Telemetry
 from edge.uav.ground.ego_motion import EgoMotion
 from edge.uav.ground.image_plane import ImagePlane
 from edge.uav.ground.plane_pose import PlanePose
 from edge.uav.timing.telemetry_offset import MAX_FRAME_GAP_S, RelativeRotations
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _NOMINAL_HEIGHT = 50.0  # the scale is not observable
 _MAX_BLIND_FRAMES = 5  # without a pose, after which tracking is restarted
