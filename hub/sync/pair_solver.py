@@ -559,9 +559,7 @@ def _peaks(offset: Floats, value: Floats, max_candidates: int) -> list[int]:
     return out
 
 
-def evaluate_alignment(
-    a: SmoothTrack, b: SmoothTrack, offset: float, pose: RelativePose, settings: PairSettings | None = None
-) -> PairFit:
+def evaluate_alignment(a: SmoothTrack, b: SmoothTrack, offset: float, pose: RelativePose) -> PairFit:
     """Quality figures of an alignment ``t_a = t_b + offset`` [s] that another method estimated."""
-    s = settings or PairSettings()
+    s = PairSettings()
     return Samples([a], [b], offset, s, s.refinement_samples).evaluate(0.0, 1.0, offset, pose)

@@ -97,15 +97,13 @@ def write_observation_log(
     rig: Rig,
     observations: Iterable[pb.Observation],
     clocks: dict[str, CameraCalibration],
-    arrivals: Arrivals | None = None,
 ) -> int:
     """Write observations as a log in the order of their exposures on the reference clock; as `session_to_log`.
 
-    clocks: calibrations of all cameras whose frames are written; those of others are left out. arrivals: of the frames,
-    in place of the exposures.
+    clocks: calibrations of all cameras whose frames are written; those of others are left out.
     """
     known = [message for message in observations if message.camera in clocks]
-    return _write_log(out, infos, rig, _with_log_times(known, arrivals or Arrivals(clocks)))
+    return _write_log(out, infos, rig, _with_log_times(known, Arrivals(clocks)))
 
 
 def _write_log(out: Path, infos: Sequence[pb.CameraInfo], rig: Rig, frames: list[tuple[int, pb.Observation]]) -> int:

@@ -136,11 +136,11 @@ def _check_pairs(rows: DetectionRows, file: Path) -> None:
             raise InputError(what, file=file, line=max(rows.line[head], rows.line[foot]), remedy="swap the labels")
 
 
-def object_messages(rows: DetectionRows, *, fill: bool = True) -> list[pb.Observation]:
+def object_messages(rows: DetectionRows) -> list[pb.Observation]:
     """The rows as observation messages with all that is known of each detection, by camera and time.
 
-    ``sequence`` is the frame number where a camera's frames are numbered, otherwise it counts. fill: also make messages
-    of the frames without a row between two with rows, where frames are numbered: they say that nobody was detected.
+    ``sequence`` is the frame number where a camera's frames are numbered, otherwise it counts. Where they are
+    numbered, frames without a row between two with rows have a message too: nobody was detected.
     """
     out: list[pb.Observation] = []
     names = np.array(rows.camera)
@@ -151,7 +151,7 @@ def object_messages(rows: DetectionRows, *, fill: bool = True) -> list[pb.Observ
         stamps, first, counts = np.unique(time_ns[mine], return_index=True, return_counts=True)
         frames = rows.frame[mine[first]]
         numbered = bool((np.diff(frames) > 0).all()) and frames[0] >= 0
-        empty_stamps, empty_frames = _empty_frames(stamps, frames) if fill and numbered else (stamps[:0], frames[:0])
+        empty_stamps, empty_frames = _empty_frames(stamps, frames) if numbered else (stamps[:0], frames[:0])
         order = np.argsort(np.concatenate([stamps, empty_stamps]), kind="stable").tolist()
         every_stamp = np.concatenate([stamps, empty_stamps]).tolist()
         every_frame = np.concatenate([frames, empty_frames]).tolist()

@@ -57,8 +57,7 @@ class FrameDiagnostics:
 class PaperTracker:
     """Tracks by colour, road and regions. Lens, mounting and telemetry are accepted but ignored, as in the paper.
 
-    size: (width, height) [px]. section: 4 for the paper's final model, 3 for the one of section 3.2. teach: statistics
-    of road and other; by default they are learnt from the first frame.
+    size: (width, height) [px]. section: 4 for the paper's final model, 3 for the one of section 3.2.
     """
 
     def __init__(
@@ -70,11 +69,10 @@ class PaperTracker:
         seed: int = 0,
         *,
         section: Literal[3, 4] = 4,
-        teach: regions.RegionStatistics | None = None,
     ) -> None:
         del lens, body_from_camera
         self.size, self.fps = size, fps
-        self._section, self._teach = section, teach
+        self._section = section
         self._rng = np.random.default_rng(seed)
         self._centre = (np.array(size, dtype=np.float64) - 1.0) / 2.0
         self._diagonal = float(np.hypot(*size))
@@ -95,7 +93,7 @@ class PaperTracker:
         road, marked = _first_road(grey, target, road_filter)
         road_course = self._road_course(road)
         small = regions.reduced(image)
-        statistics = self._teach or regions.learn_statistics(small, _first_road_pixels(small, target, road_course))
+        statistics = regions.learn_statistics(small, _first_road_pixels(small, target, road_course))
         self._track = track = _Track(target, image, background, road_filter, road, statistics)
         track.marked = marked
         track.diagnostics = _diagnose(small, statistics, road_course, BackgroundMotion(), 0)

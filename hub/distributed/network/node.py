@@ -83,7 +83,6 @@ class PoseNode:
         boot: int = 0,
         control_point: ControlPoint | None = None,
         seed: int = 0,
-        depth: int = 0,
         raw: int = RAW_CAPACITY,
         gap: float = MAX_GAP_S,
     ) -> None:
@@ -97,7 +96,7 @@ class PoseNode:
         self.refused: Counter[str] = Counter()
         self.updates = 0
         self.frame_age = 0
-        self._depth = depth
+        self._depth = 0
         self._raw = raw
         self._extrapolated: Pose | None = self.pose
         self._momentum = 0
