@@ -25,6 +25,7 @@ from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.detections import DetectionRows, read_detections
+from protocols.validation.codec import SCHEMA_VERSION
 
 Kind = Literal["person", "vehicle"]
 BOXES_FILE = "boxes.csv"
@@ -157,7 +158,7 @@ def object_messages(rows: DetectionRows) -> list[pb.Observation]:
         every_frame = np.concatenate([frames, empty_frames]).tolist()
         for index, at in enumerate(order):
             message = pb.Observation(
-                schema_version=1, camera=name, boot_id="session", device_time_ns=every_stamp[at],
+                schema_version=SCHEMA_VERSION, camera=name, boot_id="session", device_time_ns=every_stamp[at],
                 sequence=every_frame[at] if numbered else index, frame=max(every_frame[at], 0),
             )  # fmt: skip
             if at < len(stamps):

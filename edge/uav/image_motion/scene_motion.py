@@ -23,7 +23,7 @@ Gray = npt.NDArray[np.uint8]
 
 _WORKING_WIDTH = 400  # approximate width of the image on which the flow is computed [px]
 _MAX_TRACKS = 120  # for four unknowns: more cost CPU, fewer leave parts of the image to what moves in them
-_LK_LEVELS = 3  # halvings of the image: half a window of the smallest one is 52 px
+_LK_LEVELS = 3  # halvings of the image: half a window of the smallest one is 48 px
 _BACKWARD_PX = 0.7  # forward-backward distance of a good track [px of the working image]
 _RANSAC_PX = 1.5  # residual of a track of the static scene [px of the working image]
 _BENT = 0.04  # of the shift by a turn: mean of (x/f)^2 over half an image as wide as its focal length
