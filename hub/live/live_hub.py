@@ -492,7 +492,9 @@ class LiveHub:
             if job.verify and (answer.permanent or self._reloaded is None or self._reloaded.has_failed(now)):
                 self._reloaded, self.calibration = None, None  # what was reloaded does not hold any more
             if self.calibration is not None:
-                return [event]  # an answer that holds is not given up because new rows say little
+                # An answer that holds is not given up because new rows say little, but that they contradict it is told.
+                self.solver_failure = answer.reason if answer.refused.keys() & self.calibration.cameras.keys() else ""
+                return [event]
             self.refusal = Refused(answer.reason, dict(answer.refused))
             self.refusal.permanent = answer.permanent
             self._revision += 1

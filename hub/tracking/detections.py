@@ -148,7 +148,8 @@ def frame_detections(camera: TrackingCamera, message: pb.Observation) -> FrameDe
         parts = parts[good]
     point = parts[:, 0]
     inverse = np.linalg.inv(camera.intrinsics.pixel_jacobian(point)) if len(found) else np.zeros((0, 2, 2))
-    noise = np.array([_covariance(d) for d in found]).reshape(-1, 2, 2) + camera.noise_px**2 * np.eye(2)
+    entries = np.array([_covariance(d) for d in found], dtype=np.float64).reshape(-1, 3)
+    noise = entries[:, [[0, 1], [1, 2]]] + camera.noise_px**2 * np.eye(2)
     units_per_px = np.sqrt(np.abs(np.linalg.det(inverse)))
     colour = [(d.colour.red, d.colour.green, d.colour.blue) if d.HasField("colour") else (np.nan,) * 3 for d in found]
     return FrameDetections(
@@ -177,11 +178,12 @@ def tracked_kind(detection: pb.Detection) -> str:
     return kind
 
 
-def _covariance(detection: pb.Detection) -> Floats:
-    if len(detection.covariance) != 3:
-        return np.asarray(_DEFAULT_STD_PX**2 * np.eye(2))
-    uu, uv, vv = detection.covariance
-    return np.array([[uu, uv], [uv, vv]]) + MIN_STD_PX**2 * np.eye(2)
+def _covariance(detection: pb.Detection) -> tuple[float, float, float]:
+    """The entries uu, uv, vv [px²]."""
+    given = detection.covariance
+    if len(given) != 3:
+        return _DEFAULT_STD_PX**2, 0.0, _DEFAULT_STD_PX**2
+    return given[0] + MIN_STD_PX**2, given[1], given[2] + MIN_STD_PX**2
 
 
 def _pixel_or_nan(pixel_pairs: Sequence[float]) -> tuple[float, float]:

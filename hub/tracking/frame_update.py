@@ -260,13 +260,12 @@ def _update_associated(
     innovation = np.where(used, value[column] - selected.value, 0.0)
     total = matched_noise(noise[column], selected, distance[row, column], sure)
     mean, covariance = targets.mean[row], targets.covariance[row]
-    nis = kalman.normalised_innovation_squared(covariance, innovation, selected.jacobian, total, used)
+    measurement = innovation, selected.jacobian, total, used
     if manoeuvre is None:
-        mean, covariance = kalman.update(mean, covariance, innovation, selected.jacobian, total, used)
+        mean, covariance, nis, _ = kalman.update(mean, covariance, *measurement)
     else:
-        manoeuvre_covariance, prior_odds = manoeuvre.covariance[row], manoeuvre.prior_odds[row]
-        mean, covariance = gpb1_update(
-            mean, covariance, manoeuvre_covariance, prior_odds, innovation, selected.jacobian, total, used
+        mean, covariance, nis = gpb1_update(
+            mean, covariance, manoeuvre.covariance[row], manoeuvre.prior_odds[row], *measurement
         )
     means, covariances = targets.mean.copy(), targets.covariance.copy()
     means[row], covariances[row] = mean, covariance

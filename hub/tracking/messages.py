@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from hub.tracking.detections import TrackingCamera
@@ -147,22 +149,20 @@ def _predict(
         seen &= (np.abs(pixels) <= _MAX_PIXEL).all(axis=1)
     size, face = np.linalg.norm(heads - feet, axis=1), face_regions(heads, feet)
     views = head_views(targets.mean, ahead, camera, parameters)
-    for i in np.flatnonzero(seen).tolist():
+    spread = (0.5 * (covariance + covariance.swapaxes(1, 2))).reshape(-1, 4)[:, [0, 1, 3]]
+    numbers = np.hstack([pixels, speed, spread, heads, feet, size[:, None], face])[seen].tolist()
+    for i, row in zip(np.flatnonzero(seen).tolist(), numbers, strict=True):
+        kind = int(targets.kind[i])
         target = part.targets.add(
-            target=track_label(int(targets.kind[i]), int(targets.number[i])),
-            kind=TARGET_MODELS[int(targets.kind[i])].kind,
-            u=pixels[i, 0],
-            v=pixels[i, 1],
-            u_velocity=speed[i, 0],
-            v_velocity=speed[i, 1],
-            covariance=[covariance[i, 0, 0], 0.5 * (covariance[i, 0, 1] + covariance[i, 1, 0]), covariance[i, 1, 1]],
-        )
+            target=track_label(kind, int(targets.number[i])), kind=TARGET_MODELS[kind].kind, u=row[0], v=row[1],
+            u_velocity=row[2], v_velocity=row[3], covariance=row[4:7],
+        )  # fmt: skip
         _set_colour(target, targets.colour[i])
         if whole[i]:
-            target.head.extend(heads[i].tolist())
-            target.foot.extend(feet[i].tolist())
-            target.size = float(size[i])
-            target.face.extend(face[i].tolist())
+            target.head.extend(row[7:9])
+            target.foot.extend(row[9:11])
+            target.size = row[11]
+            target.face.extend(row[12:])
             target.view = views[i]
 
 
@@ -215,6 +215,7 @@ def headings(mean: Floats, parameters: TrackerParameters) -> Floats:
 
 
 def _set_colour(message: pb.Track | pb.PredictedTarget, colour: Floats) -> None:
-    if np.isfinite(colour).all():
-        red, green, blue = (round(min(max(value, 0.0), 255.0)) for value in colour.tolist())
+    values = colour.tolist()
+    if all(map(math.isfinite, values)):
+        red, green, blue = (round(min(max(value, 0.0), 255.0)) for value in values)
         message.colour.red, message.colour.green, message.colour.blue = red, green, blue

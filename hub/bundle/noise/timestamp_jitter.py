@@ -18,6 +18,7 @@ from scipy.special import chdtri, fdtri
 
 from hub.bundle.adjustment import adjust
 from hub.bundle.covariance import middles_of_overlap
+from hub.bundle.initialisation import SEEN_WITHIN_S
 from hub.bundle.noise.clock_wander import Wander, fit_wander
 from hub.bundle.normal_equations import CAUCHY_WIDTH
 from hub.bundle.problem import OFFSET, AdjustmentState, Problem, TrackObservations
@@ -118,10 +119,11 @@ def _wanders(
     rigs, whose lenses are 2 % off, it is at most 0.8 of that, on twelve with errors correlated over a second 0.9.
     """
     found, across = dict[int, Wander](), 0.0
+    times = [state.cameras[i].reference_time(frames.stamp) for i, frames in enumerate(parts)]
     for camera, frames in enumerate(parts):
         sigma = float(state.sigma[camera])
         shift, information, transverse = _independent_shifts(frames, sigma)
-        good = information > 0.0
+        good = (information > 0.0) & _is_path_held(times, camera)
         if np.count_nonzero(good) < _MIN_FRAMES:
             continue
         typical = _MAD_TO_SIGMA * float(np.median(np.abs(shift[good] - np.median(shift[good]))))
@@ -140,6 +142,15 @@ def _wanders(
     others = (one for one in found.values() if further and one.camera not in known and one.is_plausible)
     new = max(others, key=lambda one: one.gain, default=None)
     return {camera: one for camera, one in found.items() if camera in known or (one is new and one.gain > limit)}
+
+
+def _is_path_held(times: list[Floats], camera: int) -> Bools:
+    """Frames of a camera with others' frames before and after them: beyond these the path is extrapolated, and all
+    frames of such an end would be late or early together. times: of each camera's frames [s, internal]."""
+    others = np.sort(np.concatenate([[-np.inf, np.inf], *times[:camera], *times[camera + 1 :]]))
+    after = np.searchsorted(others, times[camera])
+    before = np.maximum(after - 1, 0)
+    return np.asarray(np.maximum(others[after] - times[camera], times[camera] - others[before]) <= SEEN_WITHIN_S)
 
 
 def weighted_by_jitter(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
@@ -167,7 +178,8 @@ def weighted_by_jitter(problem: Problem, state: AdjustmentState) -> tuple[Proble
 
 
 def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: int) -> _FrameRows:
-    """A camera's rows by frame, without those displaced across their motion, which no time shift explains.
+    """A camera's rows by frame, without those displaced across their motion, which no time shift explains, and those
+    whose path is extrapolated.
 
     stamped: the problem with the original timestamps.
     """
@@ -178,7 +190,7 @@ def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: 
         line, velocity = _velocity(rows, state)
         residual = line.residual - velocity * (rows.time - before.time)[:, None]
         across = np.abs(_transverse(residual, velocity)) / np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
-        good = line.valid & np.isfinite(across)
+        good = line.valid & np.isfinite(across) & _is_path_held(current, state, rows)
         good &= across < _OUTLIER_SIGMA * max(
             _MAD_TO_SIGMA * float(np.median(across[good])) if good.any() else 0.0, _MIN_SIGMA_PX
         )
@@ -190,6 +202,21 @@ def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: 
     height = np.bincount(frame, np.concatenate(heights)) / np.bincount(frame)
     clock = _clock_parameters(current, state, camera, stamp, height)
     return _FrameRows(frame, stamp, clock, np.concatenate(residuals), np.concatenate(velocities))
+
+
+def _is_path_held(problem: Problem, state: AdjustmentState, rows: TrackObservations) -> Bools:
+    """Rows (n,) with rows of the same label by other cameras before and after them: beyond these its path is
+    extrapolated, and all rows of such an end would be late or early together."""
+    others = [
+        state.cameras[part.camera].reference_time(part.time[part.use])
+        for part in problem.rows
+        if part.label == rows.label and part.camera != rows.camera
+    ]
+    known = np.sort(np.concatenate([[-np.inf, np.inf], *others]))
+    time = state.cameras[rows.camera].reference_time(rows.time)
+    after, before = known[np.searchsorted(known, time)], known[np.searchsorted(known, time, "right") - 1]
+    within = max(SEEN_WITHIN_S, *(float(np.median(np.diff(one))) for one in others if len(one) > 1), 0.0)
+    return np.asarray(np.maximum(after - time, time - before) <= within)
 
 
 def _velocity(rows: TrackObservations, state: AdjustmentState) -> tuple[LinearisedResiduals, Floats]:

@@ -344,6 +344,8 @@ def _solve(
     calibrated = all(name in prepared.cameras for name in names)
     # With more cameras the adjustment estimates lenses and tests each clock: an imprecise lag suffices to start.
     settings = replace(settings or PairSettings(), standalone=standalone or len(prepared.names) < _MIN_REDUNDANT)
+    if given is not None:
+        settings = replace(settings, min_planar_ratio=0.0)  # a given geometry is not left open by planar motion
     return solve_pair(
         smooth_only(a),
         smooth_only(b),

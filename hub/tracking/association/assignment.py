@@ -9,7 +9,7 @@ from scipy.optimize import linear_sum_assignment
 
 from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter import kalman
-from hub.tracking.filter.kalman import LOG_SIZE, STATE_DIM
+from hub.tracking.filter.kalman import LOG_SIZE
 from hub.tracking.filter.measurement import (
     FOOT,
     HEAD,
@@ -51,7 +51,7 @@ class AssociationScores:
     """Of n targets and m detections. log_ratio: (n, m), logarithm of the likelihood of a pair over that of a false
     detection that is uniform in the image, -inf outside the gate.
 
-    distance: (n, m, 3) squared Mahalanobis distances of point, head, foot, NaN where not measured.
+    distance: (n, m, 3) squared Mahalanobis distances of point, head, foot, NaN where not measured or outside the gate.
     """
 
     log_ratio: Floats
@@ -66,37 +66,48 @@ def association_scores(
     predicted: PredictedMeasurement,
     names: tuple[str, ...],
     colour_std: float = COLOUR_STD,
+    fixed: Ints | None = None,
 ) -> AssociationScores:
     """The scores of each target with each detection: of position, size and colour.
 
     value, noise: (m, 7), (m, 7, 7) measurements of the frame. names: labels of the targets. colour_std: of a channel.
+    fixed: (n,) a detection whose distance is wanted whether it is inside the gate or not, -1 = none.
     """
-    n, m = len(targets), len(frame)
-    jacobian = predicted.jacobian[:, :LOG_IMAGE_SIZE].reshape(n, 3, 2, STATE_DIM)
-    own = jacobian @ targets.covariance[:, None] @ jacobian.swapaxes(2, 3) + _blocks(predicted.model_noise)
-    both = own[:, None] + _blocks(noise)
-    a, b, c = both[..., 0, 0], both[..., 0, 1], both[..., 1, 1]
-    off = (value[None, :, :LOG_IMAGE_SIZE] - predicted.value[:, None, :LOG_IMAGE_SIZE]).reshape(n, m, 3, 2)
-    x, y = off[..., 0], off[..., 1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        distance = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
-    log_ratio = np.full((n, m), -np.inf)
-    row, column = np.nonzero((distance[:, :, 0] < POINT_GATE) & (targets.kind[:, None] == frame.kind[None, :]))
+    spread = predicted.jacobian @ targets.covariance @ predicted.jacobian.swapaxes(1, 2)
+    own, other = _blocks(spread + predicted.model_noise), _blocks(noise)
+    off = value[None, :, POINT] - predicted.value[:, None, POINT]
+    distance = np.full((len(targets), len(frame), 3), np.nan)
+    distance[:, :, 0] = _squared_distance(own[:, None, 0], other[:, 0], off)
+    log_ratio = np.full(distance.shape[:2], -np.inf)
+    near = (distance[:, :, 0] < POINT_GATE) & (targets.kind[:, None] == frame.kind[None, :])
+    if fixed is not None:
+        near[fixed >= 0, fixed[fixed >= 0]] = True
+    row, column = np.nonzero(near)
     if not len(row):
         return AssociationScores(log_ratio, distance)
+    off = (value[column, :LOG_IMAGE_SIZE] - predicted.value[row, :LOG_IMAGE_SIZE]).reshape(-1, 3, 2)
+    distance[row, column] = _squared_distance(own[row], other[column], off)
     selected = predicted.select(row)
     used = gated_rows(value[column], selected, distance[row, column], targets.covariance[row])
     innovation = np.where(used, value[column] - selected.value, 0.0)
-    total = matched_noise(noise[column], selected, distance[row, column])
-    log_likelihood = -0.5 * kalman.minus_two_log_likelihood(
-        targets.covariance[row], innovation, selected.jacobian, total, used
-    ) - 0.5 * np.log(2.0 * np.pi) * used.sum(axis=1)
-    log_ratio[row, column] = log_likelihood - _log_clutter(frame, column, used, np.isfinite(value[column]))
+    total = spread[row] + matched_noise(noise[column], selected, distance[row, column])
+    squared, log_determinant = kalman.fit(innovation, total, used)
+    log_likelihood = -0.5 * (squared + log_determinant + np.log(2.0 * np.pi) * used.sum(axis=1))
+    log_likelihood -= _log_clutter(frame, column, used, np.isfinite(value[column]))
+    log_ratio[row, column] = np.where(distance[row, column, 0] < POINT_GATE, log_likelihood, -np.inf)
     if np.isfinite(frame.colour).any():
         log_ratio[row, column] += colour_score(frame.colour[column], targets.colour[row], colour_std)
     if any(frame.target):
         log_ratio += _LOG_CAMERA_MATCH * (np.array(names)[:, None] == np.array(frame.target)[None, :])
     return AssociationScores(log_ratio, distance)
+
+
+def _squared_distance(own: Floats, other: Floats, off: Floats) -> Floats:
+    """Squared Mahalanobis distances (...) at ``off`` (..., 2), of the sum of two covariances (..., 2, 2)."""
+    a, b, c = (own[..., i, j] + other[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    x, y = off[..., 0], off[..., 1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
 
 
 def _blocks(matrix: Floats) -> Floats:
@@ -187,6 +198,8 @@ def gated_rows(value: Floats, predicted: PredictedMeasurement, distance: Floats,
     used = np.isfinite(value) & np.isfinite(predicted.value)
     for part, rows in ((1, HEAD), (2, FOOT)):
         used[:, rows] &= (distance[:, part] < PART_GATE)[:, None]
+    if not used[:, LOG_IMAGE_SIZE].any():
+        return used
     jacobian = predicted.jacobian[:, LOG_IMAGE_SIZE]
     spread = (
         np.einsum("ni,nij,nj->n", jacobian, covariance, jacobian)
@@ -205,23 +218,20 @@ def occlusions(camera: TrackingCamera, predicted: PredictedMeasurement, targets:
     touching: the silhouette touches that of another confirmed target, so the two may be detected as one. occluded:
     that other target is in front.
     """
-    n = len(targets)
-    point = predicted.value[:, POINT]
-    length = np.exp(targets.mean[:, LOG_SIZE]) / np.where(predicted.depth > 0.0, predicted.depth, np.inf)
-    along = predicted.value[:, HEAD] - predicted.value[:, FOOT]
+    seen = np.flatnonzero(camera.sees(predicted.value[:, POINT], predicted.depth))
+    point, depth = predicted.value[seen, POINT], predicted.depth[seen]
+    along = predicted.value[seen, HEAD] - predicted.value[seen, FOOT]
     norm = np.linalg.norm(along, axis=1)
     upright = np.isfinite(norm) & (norm > 0.0)
     along = np.where(upright[:, None], along / np.where(upright, norm, 1.0)[:, None], [0.0, 1.0])
-    length = np.where(upright, norm, length)
-    off = point[None] - point[:, None]
-    with np.errstate(invalid="ignore"):
-        lengthwise = np.abs((off * along[:, None]).sum(axis=2))
-        across = np.abs(off[..., 0] * along[:, None, 1] - off[..., 1] * along[:, None, 0])
-        total = length[:, None] + length[None, :]
-        width = np.where(upright, _WIDTH, _LENGTH)
-        touching = (across < width[:, None] * total) & (lengthwise < _LENGTH * total)
-    seen = camera.sees(point, predicted.depth)
-    touching &= targets.confirmed[None, :] & seen[None, :] & seen[:, None]
-    touching[np.arange(n), np.arange(n)] = False
-    further = predicted.depth[:, None] > predicted.depth[None, :]
-    return touching.any(axis=1), (touching & further).any(axis=1)
+    length = np.where(upright, norm, np.exp(targets.mean[seen, LOG_SIZE]) / depth)
+    x, y = (point[:, axis] - point[:, None, axis] for axis in (0, 1))
+    lengthwise = np.abs(x * along[:, None, 0] + y * along[:, None, 1])
+    across = np.abs(x * along[:, None, 1] - y * along[:, None, 0])
+    total = length[:, None] + length
+    width = np.where(upright, _WIDTH, _LENGTH)
+    touching = (across < width[:, None] * total) & (lengthwise < _LENGTH * total) & targets.confirmed[seen]
+    np.fill_diagonal(touching, False)
+    out = np.zeros((2, len(targets)), dtype=np.bool_)
+    out[:, seen] = touching.any(axis=1), (touching & (depth[:, None] > depth)).any(axis=1)
+    return out[0], out[1]

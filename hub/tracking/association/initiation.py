@@ -203,7 +203,7 @@ def candidate_on(
     )
     _, jacobian, variance = floor.constraint(mean[None])
     one = np.ones((1, 1), dtype=np.bool_)
-    means, covariances = kalman.update(
+    means, covariances, *_ = kalman.update(
         mean[None], covariance[None], np.zeros((1, 1)), jacobian[:, None], variance[:, None, None], one
     )
     kind = np.array([detection.kind])
@@ -211,11 +211,10 @@ def candidate_on(
     used = np.isfinite(detection.value[None]) & np.isfinite(predicted.value)
     innovation = np.where(used, detection.value[None] - predicted.value, 0.0)
     noise = np.where(np.isfinite(detection.noise[None]), detection.noise[None], 0.0) + predicted.model_noise
-    misfit = float(kalman.normalised_innovation_squared(covariances, innovation, predicted.jacobian, noise, used)[0])
-    dof = int(used.sum())
+    means, covariances, squared, _ = kalman.update(means, covariances, innovation, predicted.jacobian, noise, used)
+    misfit, dof = float(squared[0]), int(used.sum())
     if not misfit < chi2_limit(dof):
         return None
-    means, covariances = kalman.update(means, covariances, innovation, predicted.jacobian, noise, used)
     odds = prior_odds * np.exp(-0.5 * max(misfit - dof, 0.0))
     return TrackCandidate(means[0], covariances[0], (detection,), misfit / dof, float(odds / (1.0 + odds)))
 

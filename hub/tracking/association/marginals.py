@@ -17,11 +17,13 @@ def marginal_probabilities(ratio: Floats) -> tuple[Floats, Floats]:
     Each target generates at most one detection and each detection has at most one target. Williams and Lau,
     "Approximate evaluation of marginal association probabilities with belief propagation" (2014).
     """
-    to_target = np.ones_like(ratio)
-    for _ in range(_ITERATIONS if min(ratio.shape) > 1 else 1):
-        weighted = ratio * to_target
-        to_detection = ratio / (1.0 + weighted.sum(axis=1, keepdims=True) - weighted)
-        to_target = 1.0 / (1.0 + to_detection.sum(axis=0) - to_detection)
-    weighted = ratio * to_target
-    to_detection = ratio / (1.0 + weighted.sum(axis=1, keepdims=True) - weighted)
-    return weighted / (1.0 + weighted.sum(axis=1, keepdims=True)), 1.0 / (1.0 + to_detection.sum(axis=0))
+    (n, m), (row, column) = ratio.shape, np.nonzero(ratio)
+    pair = ratio[row, column]
+    weighted = pair  # few pairs are inside the gate: sums over the pairs of each target, of each detection
+    for _ in range(_ITERATIONS if min(n, m) > 1 else 1):
+        to_detection = pair / (1.0 + (np.bincount(row, weighted, n)[row] - weighted))
+        weighted = pair / (1.0 + (np.bincount(column, to_detection, m)[column] - to_detection))
+    to_detection = pair / (1.0 + (np.bincount(row, weighted, n)[row] - weighted))
+    probability = np.zeros((n, m))
+    probability[row, column] = weighted / (1.0 + np.bincount(row, weighted, n)[row])
+    return probability, np.asarray(1.0 / (1.0 + np.bincount(column, to_detection, m)))

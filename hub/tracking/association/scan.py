@@ -259,7 +259,7 @@ def _evidence(
     information, vector = np.zeros((n, STATE_DIM, STATE_DIM)), np.zeros((n, STATE_DIM))
     column, detected = np.full(n, -1), np.zeros(n)
     if len(one.frame):
-        scores = association_scores(one.frame, one.value, one.noise, there, predicted, ("",) * n, colour_std)
+        scores = association_scores(one.frame, one.value, one.noise, there, predicted, ("",) * n, colour_std, fixed)
         expected = there.existence * probability
         clutter_rate = false_detections(one.statistics, there.kind)
         log_ratio = scores.log_ratio + np.log(expected / ((1.0 - expected) * clutter_rate))[:, None]

@@ -45,8 +45,8 @@ def predict(
 
 def update(
     mean: Floats, covariance: Floats, innovation: Floats, jacobian: Floats, noise: Floats, used: Bools
-) -> tuple[Floats, Floats]:
-    """Kalman update of each state with one measurement.
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Kalman update of each state with one measurement, and what `fit` says of the measurements.
 
     innovation: (n, m), measured minus predicted. jacobian: (n, m, 7), derivative of the predicted measurement by the
     state. noise: (n, m, m) measurement covariance. used: (n, m) mask of valid rows; the others have no effect. The
@@ -54,36 +54,24 @@ def update(
     """
     innovation, jacobian, noise = mask_rows(innovation, jacobian, noise, used)
     cross = covariance @ jacobian.transpose(0, 2, 1)
-    innovation_covariance = jacobian @ cross + noise
-    gain = np.linalg.solve(innovation_covariance, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
+    total = jacobian @ cross + noise
+    solved = np.linalg.solve(total, np.concatenate([cross.transpose(0, 2, 1), innovation[:, :, None]], axis=2))
+    gain = solved[:, :, :STATE_DIM].transpose(0, 2, 1)
     i_minus_kh = np.eye(STATE_DIM) - gain @ jacobian
     new = i_minus_kh @ covariance @ i_minus_kh.transpose(0, 2, 1) + gain @ noise @ gain.transpose(0, 2, 1)
     moved = mean + (gain @ innovation[:, :, None])[:, :, 0]
-    return moved, 0.5 * (new + new.transpose(0, 2, 1))
+    squared = (innovation * solved[:, :, STATE_DIM]).sum(axis=1)
+    return moved, 0.5 * (new + new.transpose(0, 2, 1)), squared, np.linalg.slogdet(total)[1]
 
 
-def minus_two_log_likelihood(
-    covariance: Floats, innovation: Floats, jacobian: Floats, noise: Floats, used: Bools
-) -> Floats:
-    """-2 log likelihood (n,) of one measurement each, without the constant term; arguments as in `update`."""
-    squared, innovation_covariance = _innovation(covariance, innovation, jacobian, noise, used)
-    return np.asarray(squared + np.linalg.slogdet(innovation_covariance)[1])
+def fit(innovation: Floats, total: Floats, used: Bools) -> tuple[Floats, Floats]:
+    """Squared Mahalanobis distances (n,) and the logarithms (n,) of the determinants of the used rows' covariances.
 
-
-def normalised_innovation_squared(
-    covariance: Floats, innovation: Floats, jacobian: Floats, noise: Floats, used: Bools
-) -> Floats:
-    """Squared Mahalanobis distances (n,) of one measurement each; arguments as in `update`."""
-    return _innovation(covariance, innovation, jacobian, noise, used)[0]
-
-
-def _innovation(
-    covariance: Floats, innovation: Floats, jacobian: Floats, noise: Floats, used: Bools
-) -> tuple[Floats, Floats]:
-    innovation, jacobian, noise = mask_rows(innovation, jacobian, noise, used)
-    innovation_covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1) + noise
-    solved = np.linalg.solve(innovation_covariance, innovation[:, :, None])[:, :, 0]
-    return np.asarray((innovation * solved).sum(axis=1)), innovation_covariance
+    innovation: (n, m). total: (n, m, m) its covariance. Their sum is -2 log likelihood, without the constant term.
+    """
+    total, innovation = _masked(total, used), np.where(used, innovation, 0.0)
+    solved = np.linalg.solve(total, innovation[:, :, None])[:, :, 0]
+    return (innovation * solved).sum(axis=1), np.linalg.slogdet(total)[1]
 
 
 def moment_match(one: tuple[Floats, Floats], other: tuple[Floats, Floats], weight: Floats) -> tuple[Floats, Floats]:
@@ -97,12 +85,13 @@ def moment_match(one: tuple[Floats, Floats], other: tuple[Floats, Floats], weigh
 
 def mask_rows(innovation: Floats, jacobian: Floats, noise: Floats, used: Bools) -> tuple[Floats, Floats, Floats]:
     """Neutralise the unused rows of a measurement: zero innovation, zero Jacobian, unit noise."""
-    off = ~used
-    both = used[:, :, None] & used[:, None, :]
-    clear = np.where(both, noise, 0.0)
-    row = np.arange(used.shape[1])
-    clear[:, row, row] = np.where(off, 1.0, clear[:, row, row])
-    return np.where(used, innovation, 0.0), np.where(used[:, :, None], jacobian, 0.0), clear
+    return np.where(used, innovation, 0.0), np.where(used[:, :, None], jacobian, 0.0), _masked(noise, used)
+
+
+def _masked(covariance: Floats, used: Bools) -> Floats:
+    row, clear = np.arange(used.shape[1]), np.where(used[:, :, None] & used[:, None, :], covariance, 0.0)
+    clear[:, row, row] = np.where(used, clear[:, row, row], 1.0)
+    return clear
 
 
 def log_density(off: Floats, covariance: Floats) -> Floats:

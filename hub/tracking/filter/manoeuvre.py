@@ -144,18 +144,18 @@ def gpb1_update(
     jacobian: Floats,
     noise: Floats,
     used: Bools,
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, Floats]:
     """Update with one measurement each under both hypotheses, and merge the results by posterior weight.
 
     mean, covariance: of the first hypothesis. manoeuvre_covariance (n, 7, 7) and prior_odds (n,): of the second. The
-    rest as in `kalman.update`. The mixture is merged into one Gaussian: first-order generalised pseudo-Bayesian (GPB1)
-    estimator, Bar-Shalom, Li, Kirubarajan (2001), section 11.6.4.
+    rest as in `kalman.update`. The mixture is merged into one Gaussian: first-order generalised pseudo-Bayesian
+    (GPB1) estimator, Bar-Shalom, Li, Kirubarajan (2001), section 11.6.4. Also returns the normalised innovations
+    squared (n,) under the first hypothesis.
     """
-    measurement = innovation, jacobian, noise, used
-    log_ratio = kalman.minus_two_log_likelihood(covariance, *measurement) - kalman.minus_two_log_likelihood(
-        manoeuvre_covariance, *measurement
-    )
-    weight = prior_odds / (prior_odds + np.exp(np.clip(-0.5 * log_ratio, -700.0, 700.0)))
-    return kalman.moment_match(
-        kalman.update(mean, covariance, *measurement), kalman.update(mean, manoeuvre_covariance, *measurement), weight
-    )
+    n, covariances = len(mean), np.concatenate([covariance, manoeuvre_covariance])
+    twice = (np.concatenate([one, one]) for one in (innovation, jacobian, noise, used))
+    means, covariances, squared, log_determinant = kalman.update(np.concatenate([mean, mean]), covariances, *twice)
+    fit = squared + log_determinant
+    weight = prior_odds / (prior_odds + np.exp(np.clip(0.5 * (fit[n:] - fit[:n]), -700.0, 700.0)))
+    merged = kalman.moment_match((means[:n], covariances[:n]), (means[n:], covariances[n:]), weight)
+    return *merged, squared[:n]

@@ -24,11 +24,16 @@ _MIN_DEPTH = 1e-3  # m: nearer points have no image
 _STUDENT_T_DOF = 4.0
 """Degrees of freedom of the Student's t noise of heads and feet: truncated or merged silhouettes cause outliers."""
 
-_POINT_OFFSET = np.array([model.point_offset for model in TARGET_MODELS])
-_POINT_STD = np.array([model.point_std for model in TARGET_MODELS])
-_HEAD_STD = np.array([model.head_std for model in TARGET_MODELS])
-_COMMON_STD = np.array([model.common_std for model in TARGET_MODELS])
-_FOOT_STD = np.array([model.foot_std for model in TARGET_MODELS])
+_ALONG = np.array([(model.point_offset, 0.5, -0.5) for model in TARGET_MODELS])
+"""Of point, head and foot above the centre, in sizes."""
+_POINTS_VARIANCE = np.array(
+    [
+        model.common_std**2 + np.kron(np.diag([model.point_std, model.head_std, model.foot_std]) ** 2, np.ones((2, 2)))
+        for model in TARGET_MODELS
+    ]
+)
+"""Of point, head and foot, by kind (k, 6, 6), in squared sizes. A box, or a leaning body, is displaced as a whole: the
+three points have a part of their noise in common."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,36 +71,26 @@ def predict_measurement(camera: TrackingCamera, mean: Floats, kind: Ints, up: Fl
     axis = rotation @ up if up is not None else np.zeros(3)
     centre = (mean[:, POSITION] - camera.pose.position) @ rotation.T
     depth = centre[:, 2]
-    velocity = mean[:, VELOCITY] @ rotation.T
     # The three points of every target at once: (n, 3, ...) of point, head, foot.
-    along = size[:, None] * np.stack(
-        [np.where(upright, _POINT_OFFSET[kind], 0.0), np.full(n, 0.5), np.full(n, -0.5)], axis=1
-    )
+    along = size[:, None] * _ALONG[kind]
     where = centre[:, None] + along[:, :, None] * axis
-    good = (where[:, :, 2] > _MIN_DEPTH * size[:, None]) & np.isfinite(where[:, :, 2])
+    good = where[:, :, 2] > _MIN_DEPTH * size[:, None]
     good[:, 1:] &= upright[:, None]
-    safe = np.where(good, where[:, :, 2], 1.0)
-    seen = where[:, :, :2] / safe[:, :, None]
-    by_camera = np.zeros((n, 3, 2, 3))  # derivative by the position in camera axes
-    by_camera[:, :, 0, 0] = by_camera[:, :, 1, 1] = 1.0 / safe
-    by_camera[:, :, :, 2] = -seen / safe[:, :, None]
-    value, jacobian, noise = (
-        np.full((n, MEASUREMENT_DIM), np.nan),
-        np.zeros((n, MEASUREMENT_DIM, STATE_DIM)),
-        np.zeros((n, MEASUREMENT_DIM, MEASUREMENT_DIM)),
-    )
+    safe = np.where(good, where[:, :, 2], 1.0)[:, :, None]
+    seen = where[:, :, :2] / safe
+    by_position = ((rotation[:2] - seen[..., None] * rotation[2]) / safe[..., None]).reshape(n, 6, 3)
+    value, jacobian = np.full((n, MEASUREMENT_DIM), np.nan), np.zeros((n, MEASUREMENT_DIM, STATE_DIM))
     value[:, :LOG_IMAGE_SIZE] = np.where(good[:, :, None], seen, np.nan).reshape(n, 6)
-    jacobian[:, :LOG_IMAGE_SIZE, POSITION] = (by_camera @ rotation).reshape(n, 6, 3)
-    jacobian[:, :LOG_IMAGE_SIZE, LOG_SIZE] = ((by_camera @ axis) * along[:, :, None]).reshape(n, 6)
-    std = np.stack([_POINT_STD[kind], _HEAD_STD[kind], _FOOT_STD[kind]], axis=1)
-    moving = (by_camera @ velocity[:, None, :, None])[..., 0] * camera.time_std
-    flat = by_camera.reshape(n, 6, 3)
-    unit = (size**2)[:, None, None] * (flat @ flat.swapaxes(1, 2))
-    # A box, or a leaning body, is displaced as a whole: the three points have this part of their noise in common.
-    noise[:, :LOG_IMAGE_SIZE, :LOG_IMAGE_SIZE] = (_COMMON_STD[kind] ** 2)[:, None, None] * unit
-    for part, rows in enumerate((POINT, HEAD, FOOT)):
-        noise[:, rows, rows] += (std[:, part] ** 2)[:, None, None] * unit[:, rows, rows]
-        noise[:, rows, rows] += moving[:, part, :, None] * moving[:, part, None, :]
+    jacobian[:, :LOG_IMAGE_SIZE, POSITION] = by_position
+    if up is not None:
+        jacobian[:, :LOG_IMAGE_SIZE, LOG_SIZE] = (by_position @ up) * np.repeat(along, 2, axis=1)
+    noise = np.zeros((n, MEASUREMENT_DIM, MEASUREMENT_DIM))
+    spread = by_position * size[:, None, None]
+    noise[:, :LOG_IMAGE_SIZE, :LOG_IMAGE_SIZE] = _POINTS_VARIANCE[kind] * (spread @ spread.swapaxes(1, 2))
+    if camera.time_std:
+        moving = (by_position @ mean[:, VELOCITY, None])[:, :, 0] * camera.time_std
+        for rows in (POINT, HEAD, FOOT):
+            noise[:, rows, rows] += moving[:, rows, None] * moving[:, None, rows]
     _predict_log_image_size(value, jacobian, mean, depth, upright, rotation)
     noise[:, LOG_IMAGE_SIZE, LOG_IMAGE_SIZE] = _LOG_SIZE_STD**2
     return PredictedMeasurement(value, jacobian, noise, depth)
@@ -105,18 +100,21 @@ def _predict_log_image_size(
     value: Floats, jacobian: Floats, mean: Floats, depth: Floats, upright: Bools, rotation: Floats
 ) -> None:
     """Row 6: log distance from head to foot of upright targets, else log of size over depth."""
-    safe = np.where(depth > 0.0, depth, np.nan)
-    value[:, LOG_IMAGE_SIZE] = mean[:, LOG_SIZE] - np.log(safe)
-    jacobian[:, LOG_IMAGE_SIZE, POSITION] = -np.nan_to_num(1.0 / safe)[:, None] * rotation[2]
-    jacobian[:, LOG_IMAGE_SIZE, LOG_SIZE] = 1.0
     across = value[:, HEAD] - value[:, FOOT]
     length2 = (across**2).sum(axis=1)
     tall = upright & (length2 > 0.0)
+    if not tall.all():
+        ahead = depth > 0.0
+        safe = np.where(ahead, depth, 1.0)
+        value[:, LOG_IMAGE_SIZE] = np.where(ahead, mean[:, LOG_SIZE] - np.log(safe), np.nan)
+        jacobian[:, LOG_IMAGE_SIZE, POSITION] = np.where(ahead, -1.0 / safe, 0.0)[:, None] * rotation[2]
+        jacobian[:, LOG_IMAGE_SIZE, LOG_SIZE] = 1.0
     if tall.any():
-        by_difference = (across / np.where(tall, length2, 1.0)[:, None])[:, None, :]
-        chained = (by_difference @ (jacobian[:, HEAD] - jacobian[:, FOOT]))[:, 0]
-        value[:, LOG_IMAGE_SIZE] = np.where(tall, 0.5 * np.log(np.where(tall, length2, 1.0)), value[:, LOG_IMAGE_SIZE])
-        jacobian[:, LOG_IMAGE_SIZE] = np.where(tall[:, None], chained, jacobian[:, LOG_IMAGE_SIZE])
+        length2, across = length2[tall], across[tall]
+        value[tall, LOG_IMAGE_SIZE] = 0.5 * np.log(length2)
+        ends = jacobian[tall]
+        by_difference = (across / length2[:, None])[:, None, :]
+        jacobian[tall, LOG_IMAGE_SIZE] = (by_difference @ (ends[:, HEAD] - ends[:, FOOT]))[:, 0]
 
 
 def student_t_inflation(squared: Floats) -> Floats:

@@ -10,7 +10,7 @@ from google.protobuf.message import Message
 
 from hub.live.agent import status_message
 from hub.live.live_hub import LiveHub, LiveSettings
-from hub.live.solver import InlineSolver, SolverJob
+from hub.live.solver import InlineSolver, SolverAnswer, SolverJob
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.ranges import MAX_DISTORTION
 from protocols.messages import syncline_pb2 as pb
@@ -254,6 +254,24 @@ def test_ill_health_of_a_calibrated_hub_is_told(session: Session) -> None:
     hub._submitted_at = now - 11.0
     assert "the solver is behind: 11 s for one job" in hub.state(now)[1]
     assert {one.camera: one.state for one in hub.progress()} == dict.fromkeys(session.rig.cameras, "calibrated")
+
+
+class RefusingSolver(InlineSolver):
+    """A solver to which the rows of cam1 contradict every answer."""
+
+    def submit(self, job: SolverJob, now: float) -> None:
+        self._answer = SolverAnswer(job.number, reason="no two cameras", refused={"cam1": "only 10 % fit"})
+
+
+def test_an_answer_that_the_newest_rows_contradict_is_kept_and_the_hub_says_so(session: Session) -> None:
+    hub, stream = LiveHub(SETTINGS), messages(session)
+    feed(hub, stream[:-200])
+    hub.solver = RefusingSolver()
+    for tick, message in enumerate(stream[-200:]):
+        hub.handle(message)
+        hub.tick(2e6 + tick)
+    assert hub.calibration is not None
+    assert "no two cameras" in hub.state(hub._now)[1]
 
 
 def test_more_rows_replace_an_answer_whatever_their_stds_and_the_session_is_the_answers(session: Session) -> None:

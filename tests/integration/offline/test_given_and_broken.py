@@ -211,13 +211,16 @@ def test_candidates_at_other_frame_rates_do_not_displace_those_at_the_nominal_on
     assert find_time_map(camera, path, (1.0, 2.0))[0] == find_time_map(camera, path, (1.0,))[0]
 
 
-def test_a_false_detection_that_stays_in_one_place_does_not_displace_a_resected_pose() -> None:
+@pytest.mark.parametrize(("wrong", "place"), [(12, (0.4, -0.3)), (4, (-0.1, 0.15))])
+def test_a_false_detection_that_stays_in_one_place_does_not_displace_a_resected_pose(
+    wrong: int, place: tuple[float, float]
+) -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1.0, 1.0, (80, 3)) + [0.0, 0.0, 4.0]
     seen = points[:, :2] / points[:, 2:]
-    seen[:12] = [0.4, -0.3]
+    seen[:wrong] = place
     residual = resection_scan.resected_residuals(points, seen, points, seen, 500.0)
-    assert np.median(residual[12:]) < 1.0
+    assert np.median(residual[wrong:]) < 1.0
 
 
 def test_a_broken_camera_does_not_get_the_long_search_that_a_pair_alone_gets(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -398,6 +401,18 @@ def test_known_cameras_in_one_place_are_refused_in_one_line(four: tuple[rigs.Ses
         calibrate(session.rig, session.observations(), known=FixedCalibration(cameras, "metric"))
     with pytest.raises(Refused, match="in one place"):
         triangulate(session.rig, cameras, session.observations())
+
+
+def test_with_known_poses_motion_in_a_plane_gives_the_lags() -> None:
+    path = rigs.random_path(np.random.default_rng(8))
+    session = rigs.simulate(7, 3, 20.0, path=path)
+    known = FixedCalibration(dict(calibrate(session.rig, session.observations()).cameras), "arbitrary")
+    flat = rigs.simulate(7, 3, 20.0, path=replace(path, amplitude=path.amplitude * [1.0, 1.0, 0.0]))
+    found = calibrate(flat.rig, flat.observations(), known=known)
+    for name in ("cam1", "cam2"):
+        assert abs(flat.clock_error(name, "cam0", found.cameras[name].time_map)) < 2e-3
+    with pytest.raises(Refused, match="in one plane"):
+        calibrate(flat.rig, flat.observations())
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-3])

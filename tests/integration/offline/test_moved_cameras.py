@@ -46,6 +46,13 @@ def test_a_turned_camera_is_named_and_its_longer_side_is_used(cameras: int, sinc
     assert abs(error) < 1e-3
 
 
+def test_a_moved_camera_is_named_though_the_path_follows_it_where_only_one_other_sees_the_target() -> None:
+    windows = [(0.0, 60.0)] * 2 + [(0.0, 27.0), (14.0, 60.0)]
+    session = turned(simulate(16, 4, 60, outliers=0.02, windows=windows), "cam1", 21.0, 0.08)
+    (warning,) = [text for text in calibrate(*_given(session), thorough=True).warnings if "it was moved" in text]
+    assert warning.startswith("cam1: ")
+
+
 def test_cameras_that_stand_still_are_not_moved() -> None:
     for seed in range(3):
         found = calibrate(*_given(simulate(seed, 4, 20)), thorough=True)

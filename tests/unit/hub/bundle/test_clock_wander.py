@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,10 +12,14 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from hub.bundle.noise.clock_wander import fit_wander
+from hub.bundle.noise.timestamp_jitter import _is_path_held
+from hub.bundle.problem import CameraState, TrackObservations
 from hub.calibration.incremental import update_calibration
 from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import CameraTime
-from protocols.geometry.types import Floats
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Bools, Floats
 from tests.bench import clock_models
 from tests.support import rigs
 
@@ -67,6 +72,18 @@ def test_correlated_errors_are_no_wander() -> None:
     assert not [text for text in found.warnings if "rate changes" in text]
 
 
+@pytest.mark.parametrize("seed", [2, 12])
+def test_a_path_extrapolated_where_one_camera_sees_the_target_is_no_wander(seed: int) -> None:
+    session, random = rigs.simulate(seed, 2, 60.0, noise=2.0), np.random.default_rng(seed)
+    keep, camera = np.ones(len(session.time), dtype=np.bool_), np.array(session.camera)
+    for name in session.rig.cameras:  # out of view half of the time, two seconds each on average
+        time = session.time[camera == name]
+        keep[camera == name] = np.searchsorted(np.cumsum(random.exponential(2.0, 99)), time - time.min()) % 2 == 0
+    found = calibrate(session.rig, session.observations(np.flatnonzero(keep)))
+    assert not [text for text in found.warnings if "rate changes" in text]
+    assert abs(session.clock_error("cam1", "cam0", found.cameras["cam1"].time_map)) < 4e-3
+
+
 @pytest.mark.parametrize("slewed", ["cam0", "cam2"])
 def test_a_clock_that_is_slewed_live_is_followed_also_as_the_reference(slewed: str) -> None:
     session = rigs.simulate(60, 5, 45.0)
@@ -87,3 +104,22 @@ def test_a_clock_that_is_slewed_live_is_followed_also_as_the_reference(slewed: s
         shown = session.shown("cam0", true) + (added(np.array([true]))[0] if slewed == "cam0" else 0.0)
         error = float(camera.time_map.reference_from_camera(CameraTime(camera.lag_time))) - shown
         assert abs(error) < 4.0 * camera.lag_std + 1e-6
+
+
+@pytest.mark.parametrize("interval", [0.04, 0.5])
+def test_rows_are_shifted_where_others_hold_the_path_of_their_label(interval: float) -> None:
+    times = np.arange(0.0, 20.0, interval)
+    camera = CameraState(Intrinsics(640, 480, np.eye(3)), Pose.identity(), 1.0, 0.0, 0.0)
+
+    def rows(number: int, label: int, seen: Bools) -> TrackObservations:
+        time = times[seen]
+        return TrackObservations(number, label, time, np.zeros((len(time), 2)), np.ones(len(time), np.bool_))
+
+    every, early = times >= 0.0, (times < 8.0) | (times > 15.0)
+    parts = (rows(0, 0, every), rows(1, 0, every), rows(0, 1, every), rows(1, 1, early), rows(2, 1, times < 5.0))
+    problem, state = SimpleNamespace(rows=parts), SimpleNamespace(cameras=(camera,) * 3)
+    held = [_is_path_held(problem, state, part) for part in parts]  # type: ignore[arg-type]
+    assert held[0].all()
+    assert held[1].all()
+    np.testing.assert_array_equal(held[2], (times < 8.0 - 1e-9) | (times > 15.0))
+    assert held[3].all()

@@ -59,7 +59,7 @@ def test_filtering_equals_the_batch_least_squares_solution() -> None:
     for elapsed, (jacobian, seen, noise) in zip(steps, measurements, strict=True):
         mean, covariance = kalman.predict(mean, covariance, elapsed, np.array([psd[0]]), *psd[1:])
         off = (seen - jacobian @ mean[0])[None]
-        mean, covariance = kalman.update(
+        mean, covariance, *_ = kalman.update(
             mean, covariance, off, jacobian[None], noise[None], np.ones((1, 4), dtype=bool)
         )
     np.testing.assert_allclose(mean[0], batch, rtol=1e-4, atol=1e-5)
@@ -101,7 +101,7 @@ def test_covariances_stay_symmetric_and_positive(noise: float) -> None:
     for _ in range(50):
         mean, covariance = kalman.predict(mean, covariance, 0.03, np.array([1.0]), 1e-4)
         jacobian = rng.normal(size=(1, 2, STATE_DIM))
-        mean, covariance = kalman.update(
+        mean, covariance, *_ = kalman.update(
             mean, covariance, rng.normal(size=(1, 2)), jacobian, noise * np.eye(2)[None], np.ones((1, 2), dtype=bool)
         )
     assert np.isfinite(covariance).all()
