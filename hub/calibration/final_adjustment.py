@@ -30,6 +30,8 @@ def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem
         step = clock_steps.find_clock_step(problem, state)
         if step is None:
             break
+        # Both from converged priors: with keypoints of people, more rounds alone gained more than a step.
+        problem, state, _ = adjust(problem, state, rounds=2)
         trial, found = _with_sizes(problem, state, step)
         supported = all(clock_steps.is_step_supported(problem, one) for one in found.clock_steps)
         if not supported or not _bic_prefers(trial, found, problem, state, 2):
