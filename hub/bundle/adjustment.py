@@ -58,7 +58,9 @@ def adjust(
     coarse: leave out the last, fine round, for an initial estimate that is adjusted again.
     Returns the problem with inliers marked, the state, and the motion prior used.
     """
-    prior = estimate_smoothness(problem, state, weak=True)
+    # One path's prior recovers from a weak start in two rounds. Those of people's keypoints, whose strengths differ by
+    # orders of magnitude, do not: steps and readouts were invented from what the rounds after them gained.
+    prior = estimate_smoothness(problem, state, weak=coarse or rounds > 2 or len(state.trajectories) == 1)
     robust = True
     steps = list(state.steps)
     for round_index in range(rounds):
