@@ -193,7 +193,7 @@ def _without_clutter(track: Track, warnings: list[str]) -> Track:
         at = np.hypot(*(track.pixels - spot).T) <= CELL_PX
         warnings.append(
             f"{track.camera}: {at.sum()} of {every} rows ({at.sum() / every:.1%}) are at pixel ({spot[0]:.0f}, "
-            f"{spot[1]:.0f}), again and again while the target moves elsewhere: a lamp or reflection? They are left out; cover it"
+            f"{spot[1]:.0f}), again and again while the target moves elsewhere: a lamp? They are left out; cover it"
         )
         track = track.select(~at)
     return track
