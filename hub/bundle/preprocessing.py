@@ -9,6 +9,7 @@ import numpy as np
 
 from hub.bundle.initialisation import CameraInput
 from hub.bundle.problem import LensPrior, TrackObservations
+from hub.trajectory.clutter import CELL_PX, static_clutter
 from hub.trajectory.discrete import sampled_track
 from hub.trajectory.image_tracks import ImageTrack, SmoothTrack, smooth_track, without_clock_steps
 from protocols.geometry.camera import Intrinsics
@@ -100,6 +101,8 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
         tracks, clock_step = without_clock_steps(observations.of_camera(name))
         if clock_step:
             warnings.append(f"{name}: {clock_step}")
+        if not rig.shared_clock:  # with one, nothing need move smoothly
+            tracks = [one for track in tracks if len(one := _without_clutter(track, warnings))]
         if not tracks:
             refused[name] = "no observations"
             return
@@ -181,6 +184,19 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
         uncalibrated,
         outlines=outlines,
     )
+
+
+def _without_clutter(track: Track, warnings: list[str]) -> Track:
+    """The track without the rows at fixed pixels that are no target; ``warnings`` gets what was left out."""
+    every = len(track)
+    while len(track) and (spot := static_clutter(track.pixels)) is not None:
+        at = np.hypot(*(track.pixels - spot).T) <= CELL_PX
+        warnings.append(
+            f"{track.camera}: {at.sum()} of {every} rows ({at.sum() / every:.1%}) are at pixel ({spot[0]:.0f}, "
+            f"{spot[1]:.0f}), again and again while the target moves elsewhere: a lamp? They are left out; cover it"
+        )
+        track = track.select(~at)
+    return track
 
 
 def _typical_std(tracks: list[Track]) -> float:

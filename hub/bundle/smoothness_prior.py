@@ -145,6 +145,23 @@ def smoothness_terms(path: Trajectory, weight: Floats, scatter: PathScatter | No
     return band, gradient, value
 
 
+def deformation_terms(path: Trajectory, weight: Floats, scatter: PathScatter) -> tuple[Floats, Floats]:
+    """What `smoothness_terms` holds against projective maps of a path, by its fixed metric alone.
+
+    (3 n, 12) and (12, 12): border and corner, in the normal equations, of the twelve coefficients of a map, in units of
+    the path's extent, 0 with std 1. Of a mapped path, the third differences are expected to be mapped too.
+    """
+    spread = _scatter(path.control[scatter.control_mask], scatter.floor)
+    extent, metric = np.sqrt(np.trace(spread)), scatter.scale * np.linalg.inv(spread)
+    place = (path.control - path.control[scatter.control_mask].mean(axis=0)) / extent
+    maps = [extent * np.outer(one, axis) for one in place.T for axis in np.eye(3)]
+    maps += [extent * one[:, None] * place for one in place.T]
+    moved = np.stack([third_differences(path.basis, one) for one in maps])
+    pull = np.where(scatter.seen, weight, 0.0)[:, None] * (moved @ metric)
+    border = np.stack([third_difference_gradient(path.basis, one) for one in pull], axis=1)
+    return border, np.eye(len(maps)) + np.einsum("kmi,lmi->kl", pull, moved)
+
+
 def _half_gradient(
     path: Trajectory, differences: Floats, weight: Floats, scatter: PathScatter | None
 ) -> tuple[Floats, Floats]:

@@ -6,10 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.bundle.bordered_system import eliminate
-from hub.bundle.covariance import Covariance
+from hub.bundle.covariance import Covariance, eliminate_paths
 from hub.bundle.model_comparison import LENS, ScoreTest, refuted_lenses
-from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
 from protocols.geometry.types import Floats
@@ -60,7 +58,7 @@ def sensitivities(
     held = [i for i in range(len(names)) if problem.lens_prior(i) is None and not free.lens]
     if held:
         freed = replace(problem, free_parameters=replace(free, lens=True))
-        normal, columns = eliminate(build_system(freed, state, prior, robust=False)[0]).reduced, freed.free_columns()
+        normal, columns = eliminate_paths(freed, state, prior)[0].reduced, freed.free_columns()
         focal = normal.columns(np.searchsorted(columns, np.array(held) * CAMERA_PARAMETERS + FOCAL))
         changes = -found.spread(found.free @ focal[np.searchsorted(columns, base)])
         lenses = dict(zip(held, changes.T, strict=True))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -48,6 +48,9 @@ _MAX_Z = 2.0
 """Residuals over the detector's stds, or the reverse, from which these are reported as wrong."""
 _MAX_REJECTED = 0.2
 """Share of a camera's rows that is left out without a warning: a detector is rarely wrong more often."""
+_MAX_DEPTH_STD = 0.05
+"""Largest std of a path over its distance that its errors follow. Depth is one over disparity: of an error e of 1.96
+stds, e² is then a quarter of the depth's std, which alone is 1.36 of one std for three axes."""
 _MAX_SAMPLES = 4_000_000
 """Of one path: 4.6 hours at 240 Hz."""
 
@@ -168,6 +171,7 @@ def assemble_calibration(
         )
         for i, name in enumerate(names)
     }
+    tables = _tables(rig, solution.prepared, names, reconstruction.labels, problem, state, covariance, reference)
     return Calibration(
         cameras=cameras,
         reference=names[reference],
@@ -178,9 +182,7 @@ def assemble_calibration(
         refused=solution.refused,
         acceptance=solution.acceptance,
         convergence=reconstruction.state.steps,
-        trajectories=_tables(
-            rig, solution.prepared, names, reconstruction.labels, problem, state, covariance, reference
-        ),
+        trajectories=tables,
         pairs=tuple(_pair_report(pair, cameras, middles, state, names, solution) for pair in solution.pairs),
         warnings=solution.prepared.warnings
         + solution.warnings
@@ -196,6 +198,7 @@ def assemble_calibration(
         + _wandering_clocks(names, state, time_scales)
         + _clock_step_warnings(cameras)
         + _wrong_detector_stds(cameras)
+        + _uncertain_depths(tables, state)
         + _large_residuals(names, state),
         residuals={
             name: _residual_rows(problem, state, i, time_origins[i], time_scales[i]) for i, name in enumerate(names)
@@ -400,6 +403,19 @@ def _wrong_detector_stds(cameras: dict[str, CameraCalibration]) -> tuple[str, ..
         for name, camera in cameras.items()
         if camera.detector_z > 0.0 and not 1.0 / _MAX_Z < camera.detector_z < _MAX_Z
     )
+
+
+def _uncertain_depths(tables: Iterable[TrajectoryTable], state: AdjustmentState) -> tuple[str, ...]:
+    """One sentence for each path whose depth is known so badly that its errors are not as its stds say."""
+    out = list[str]()
+    for table in tables:
+        some = slice(None, None, 1 + len(table.std) // 1000)
+        distances = [np.linalg.norm(table.position[some] - one.pose.position, axis=1) for one in state.cameras]
+        share = float(np.median(table.std[some] / np.min(distances, axis=0))) if len(table.std) else 0.0
+        if share > _MAX_DEPTH_STD:
+            text = "of its distance (std): errors are larger than that tells; move the cameras apart"
+            out.append(f"{table.label}: its path is known to {share:.0%} {text}")
+    return tuple(out)
 
 
 def _time_map_std(

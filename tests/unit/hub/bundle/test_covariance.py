@@ -20,11 +20,11 @@ from hub.bundle.problem import (
     TrackObservations,
     Trajectory,
 )
-from hub.bundle.smoothness_prior import SmoothnessPrior
+from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.calibration.pipeline import calibrate
 from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
-from tests.support.rigs import random_lens, random_path, random_poses, simulate
+from tests.support.rigs import looking_at, random_lens, random_path, random_poses, simulate
 
 RUNS, SECONDS = 40, 12.0
 
@@ -192,3 +192,30 @@ def test_relative_clock_stds_are_those_in_the_middle_of_the_common_span(
     assert stds[0, 2] == pytest.approx(np.sqrt(4e-6 + 20.0**2 * 1e-8))  # no common span: middle of the gap
     np.testing.assert_array_equal(stds, stds.T)
     assert not np.diag(stds).any()
+
+
+def test_the_smoothness_of_a_path_does_not_hold_its_depth() -> None:
+    """A pair with a baseline of 4 % of the distance: what little the rows tell of the depth is all there is."""
+    rng = np.random.default_rng(3)
+    lenses = [random_lens(rng) for _ in range(2)]
+    places = (np.array([5.0, 0.0, 0.0]), np.array([5.0, 0.2, 0.0]))
+    cameras = tuple(
+        CameraState(lens, looking_at(place, np.zeros(3)), 1.0, 10.0, 10.0)
+        for lens, place in zip(lenses, places, strict=True)
+    )
+    basis = SplineBasis.covering(np.array([0.0]), np.array([20.0]), 0.3)
+    grid = np.arange(0, 20, 0.02)
+    path = Trajectory(basis, fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid))))
+    rows = []
+    for i, camera in enumerate(cameras):
+        time = np.arange(0, 20, 0.035)
+        seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(time)))
+        rows.append(TrackObservations(i, 0, time, seen, np.ones(len(time), dtype=bool)))
+    problem = Problem(tuple(rows), tuple(lenses), 0, (0, 1))
+    state = AdjustmentState(cameras, (path,), np.full(2, 0.5))
+    prior = estimate_smoothness(problem, state)
+    with_prior, without = (
+        cov.relative_rotation_stds(cov.covariance(problem, state, one), state)[1, 0]
+        for one in (prior, replace(prior, weights=tuple(1e-4 * weight for weight in prior.weights)))
+    )
+    assert with_prior > 0.6 * without
