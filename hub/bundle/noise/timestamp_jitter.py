@@ -119,11 +119,10 @@ def _wanders(
     rigs, whose lenses are 2 % off, it is at most 0.8 of that, on twelve with errors correlated over a second 0.9.
     """
     found, across = dict[int, Wander](), 0.0
-    times = [state.cameras[i].reference_time(frames.stamp) for i, frames in enumerate(parts)]
     for camera, frames in enumerate(parts):
         sigma = float(state.sigma[camera])
         shift, information, transverse = _independent_shifts(frames, sigma)
-        good = (information > 0.0) & _is_path_held(times, camera)
+        good = information > 0.0
         if np.count_nonzero(good) < _MIN_FRAMES:
             continue
         typical = _MAD_TO_SIGMA * float(np.median(np.abs(shift[good] - np.median(shift[good]))))
@@ -142,15 +141,6 @@ def _wanders(
     others = (one for one in found.values() if further and one.camera not in known and one.is_plausible)
     new = max(others, key=lambda one: one.gain, default=None)
     return {camera: one for camera, one in found.items() if camera in known or (one is new and one.gain > limit)}
-
-
-def _is_path_held(times: list[Floats], camera: int) -> Bools:
-    """Frames of a camera with others' frames before and after them: beyond these the path is extrapolated, and all
-    frames of such an end would be late or early together. times: of each camera's frames [s, internal]."""
-    others = np.sort(np.concatenate([[-np.inf, np.inf], *times[:camera], *times[camera + 1 :]]))
-    after = np.searchsorted(others, times[camera])
-    before = np.maximum(after - 1, 0)
-    return np.asarray(np.maximum(others[after] - times[camera], times[camera] - others[before]) <= SEEN_WITHIN_S)
 
 
 def weighted_by_jitter(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
