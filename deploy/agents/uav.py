@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from edge.mavlink.roles.autopilot import Autopilot
     from edge.mavlink.roles.camera import CameraComponent, OperatorCommand
     from edge.mavlink.roles.camera_messages import VideoStream
-    from edge.uav.base import Estimate, Image
+    from edge.uav.base import Estimate
     from edge.uav.world.flight_world import FlightWorld
+    from protocols.geometry.types import Image
 
 _HOVER_HEIGHT_M = 62.0  # m above the ground
 _GIMBAL_PITCH_RAD = math.radians(-62.0)

@@ -13,7 +13,8 @@ from protocols.core.jpeg import encode_jpeg
 
 if TYPE_CHECKING:
     from edge.mavlink.roles.camera_messages import VideoStream
-    from edge.uav.base import Estimate, Image
+    from edge.uav.base import Estimate
+    from protocols.geometry.types import Image
 
 
 class OperatorVideo:

@@ -28,11 +28,7 @@ _INPUTS = [OBSERVATION, CAMERA_INFO, RIG_INFO]
 
 
 def replay_through_hub(
-    log: Path,
-    out: Path,
-    settings: LiveSettings | None = None,
-    agent: str = "hub",
-    calibration: Path | None = None,
+    log: Path, out: Path, settings: LiveSettings | None = None, calibration: Path | None = None
 ) -> int:
     """Write the messages that a hub publishes for the input of a log to a new log; returns their number.
 
@@ -50,10 +46,10 @@ def replay_through_hub(
         def publish(final: bool = False) -> int:
             published = hub.tick((now_ns - (first_ns or 0)) / NANOSECONDS, final=final)
             for message in published:
-                writer.write(_TOPICS[message.DESCRIPTOR.name], agent, site, message, now_ns)
+                writer.write(_TOPICS[message.DESCRIPTOR.name], "hub", site, message, now_ns)
             smoothed = [] if hub.tracking is None else hub.tracking.smoothed()
             for track in smoothed:
-                writer.write(TRACK_SMOOTHED, agent, site, track, now_ns)
+                writer.write(TRACK_SMOOTHED, "hub", site, track, now_ns)
             return len(published) + len(smoothed)
 
         for logged in reader.messages(_INPUTS if recorded is None else [*_INPUTS, SOLVER_EVENT]):

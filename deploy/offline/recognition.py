@@ -19,10 +19,10 @@ from edge.detectors.board.finder import Finder, chessboard_of_any_size
 from edge.detectors.board.saddles import linked_saddles
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
-from edge.devices.base import Image
 from edge.devices.playback.video_reader import VideoFrame, VideoReader
 from edge.offline.sampling import sample_images
 from protocols.core.errors import InputError, Refused
+from protocols.geometry.types import Image
 
 BOARDS = ("charuco", "chessboard", "tag")
 DETECTORS = ("charuco", "chessboard", "tag", "bright", "marker", "person", "vehicle", "auto")

@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edge.devices.base import Image
 from edge.devices.playback.video_reader import VideoReader
 from protocols.core.clocks import CameraTime, TimeMap
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import read_text
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 from protocols.session.calibration import read_calibration
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from deploy.offline.track import TrackedFrame
-from edge.uav.base import Image, TrackState
-from protocols.geometry.types import Floats
+from edge.uav.base import TrackState
+from protocols.geometry.types import Floats, Image
 
 _MARGIN = 0.5  # fraction of the image size added on each side
 _MAX_CANVAS_PX = 1280  # side of the overlay's picture: fits a screen

@@ -118,7 +118,7 @@ class Bundle:
         return sum(path.stat().st_size for path in (self.out / _WHEELS).glob("*.whl")) / 1e6
 
 
-def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = (), keep_budget: bool = True) -> Bundle:
+def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = ()) -> Bundle:
     """Collect the wheels and write the bundle to ``out``.
 
     extras: optional dependency groups of the project, such as ``oak``, or packages of other roles, such as scipy.
@@ -148,7 +148,7 @@ def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = ()
     script.write_text(_script(role, target), encoding="utf-8")
     script.chmod(0o755)
     budget = BUDGET_MB.get(role)
-    if keep_budget and budget is not None and "oak" not in extras and bundle.installed_mb > budget:
+    if budget is not None and "oak" not in extras and bundle.installed_mb > budget:
         raise Refused(
             f"{bundle.installed_mb:.0f} MB installed, a {role} may take {budget:.0f} MB: see the largest wheels"
         )

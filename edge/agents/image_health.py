@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from edge.devices.base import Frame, Image
+from edge.devices.base import Frame
+from protocols.geometry.types import Image
 
 REPORT_DELAY_S = 1.0
 """Duration of a fault [s] before it is reported; half the allowed latency of a status."""

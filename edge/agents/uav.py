@@ -20,7 +20,7 @@ from edge.agents.thumbnails import thumbnail_message
 from edge.agents.uav_guidance import FRAME_TIMEOUT_S, LINK_STALE_S, GuidanceControl
 from edge.agents.uav_settings import UavSettings
 from edge.detectors.base import Detector
-from edge.devices.base import Device, Frame, Image
+from edge.devices.base import Device, Frame
 from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.link.receiver import Receiver
 from edge.mavlink.roles.camera import ArmFollow, CameraComponent, OperatorCommand, SelectTarget
@@ -34,6 +34,7 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.core.jpeg import encode_jpeg
 from protocols.core.version import VERSION
 from protocols.geometry import so3
+from protocols.geometry.types import Image
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import (
     FLIGHT_IMAGE,

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias, runtime_checkable
-
-import numpy as np
-import numpy.typing as npt
+from typing import Literal, Protocol, runtime_checkable
 
 from edge.detectors.base import Detection
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
-
-Image: TypeAlias = npt.NDArray[np.uint8]
-"""(H, W, 3) uint8, channels in OpenCV's order: blue, green, red."""
+from protocols.geometry.types import Image
 
 ClockKind = Literal["device", "monotonic", "unix", "stream"]
 """The clock of the device times: the camera's own oscillator, the host's monotonic clock, the host's Unix time,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -141,24 +141,24 @@ def detected_frames(
         yield from zip(batch, seen, strict=True)
 
 
-def detection_rows(camera: str, collected: Collected, names: Mapping[str, str] | None = None) -> list[str]:
-    """The lines of observations.csv, without its header. names: other names of labels; those not in it are left out."""
+def detection_rows(camera: str, collected: Collected) -> list[str]:
+    """The lines of observations.csv, without its header."""
     cell = csv_cell(camera)
     return [
-        ",".join((cell, str(number), f"{time:.17g}", _cells(one, one.label if names is None else names[one.label])))
+        ",".join((cell, str(number), f"{time:.17g}", _cells(one)))
         for number, (time, seen) in collected.items()
         for one in seen
-        if names is None or one.label in names
     ]
 
 
-def _cells(one: Detection, label: str) -> str:
+def _cells(one: Detection) -> str:
     """The cells from ``u`` on."""
     parts: list[float | None] = []
     for part, length in ((one.covariance, 3), (one.head, 2), (one.foot, 2), (one.box, 4)):
         parts += [None] * length if part is None or not all(map(math.isfinite, part)) else list(part)
     size = one.size if one.size > 0 else None
-    return ",".join((_numbers((one.u, one.v, size)), csv_cell(label), f"{one.score:.6g}", one.kind, _numbers(parts)))
+    place = _numbers((one.u, one.v, size))
+    return ",".join((place, csv_cell(one.label), f"{one.score:.6g}", one.kind, _numbers(parts)))
 
 
 def _numbers(values: Iterable[float | None]) -> str:

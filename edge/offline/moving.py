@@ -17,7 +17,7 @@ from edge.offline.detections import Collected, VideoDetections, detection_rows, 
 from protocols.core.errors import Refused
 
 if TYPE_CHECKING:
-    from edge.devices.base import Image
+    from protocols.geometry.types import Image
 
 MovingDetector = PersonDetector | VehicleDetector
 _LEARN_S, _LEARN_IMAGES = 60.0, 48  # from the beginning of a video: in a minute everybody has moved

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from edge.detectors.base import Detection
-from edge.devices.base import Image
 from edge.devices.playback.video_reader import VideoReader
 from edge.devices.playback.video_writer import video_writer
+from protocols.geometry.types import Image
 
 _HUES = 12  # that the eye can tell apart
 

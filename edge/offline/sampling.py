@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from edge.devices.base import Image
 from edge.devices.playback.video_reader import VideoReader, has_pyav, upright_image
+from protocols.geometry.types import Image
 
 _READ_WHOLE = 600  # frames: a shorter video is decoded from its beginning
 

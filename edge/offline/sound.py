@@ -12,7 +12,7 @@ from protocols.geometry.types import Floats
 ENERGY_RATE = 500.0
 """Samples of the energy a second: sound travels 0.7 m in one."""
 _WINDOW = 16  # samples of one energy
-_LONGEST_S = 3600.0
+_LONGEST_S = 3600.0  # s of sound: bounds what is decoded and held, 29 million samples
 
 
 def sound_energy(path: Path) -> tuple[float, Floats] | None:

@@ -13,14 +13,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.base import Basis, Box, Estimate, Telemetry, TrackState
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.ground.photometric import contrast_table
 from edge.uav.ground_tracker import GroundTracker
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _OBLIQUE_COSINE = 0.7  # of that angle, 45 degrees, beyond which the appearance joins in
 _STEEP_COSINE = 0.82  # of the angle between optical axis and vertical, 35 degrees: the ground fills the image

@@ -11,12 +11,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
+from protocols.geometry.types import Floats, Image
 
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
+LOST_STD, LOST_AFTER_S = 8.0, 15.0  # std in target lengths, time unseen: beyond, an estimate is of no use
 
 
 class TrackState(StrEnum):

@@ -15,23 +15,23 @@ import numpy as np
 from google.protobuf.message import Message
 
 from edge.uav import tracker_factory
-from edge.uav.base import Box, Estimate, Image, Telemetry, Tracker, TrackState
+from edge.uav.base import Box, Estimate, Telemetry, Tracker, TrackState
 from edge.uav.georeference import Georeference
 from edge.uav.navigation import Origin, rotation_from_quaternion
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.jpeg import decode_jpeg
+from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 from protocols.messages import syncline_pb2 as pb
 from protocols.validation.codec import SCHEMA_VERSION
 
 _TELEMETRY_BUFFER = 200  # telemetry samples kept from before a target is selected
 _PARTICLES_EVERY, _ROAD_EVERY = 6, 15  # frames
-_MAX_PARTICLES, _MAX_ROAD_POINTS = 100, 600
-_MAX_PIXEL = 1e6
+_MAX_PARTICLES, _MAX_ROAD_POINTS = 100, 600  # that a message shows: enough for the operator's picture
 _DEFAULT_BOX_M = 5.5  # side of the box placed around a selected point where the height above ground is known
-_DEFAULT_BOX_PX = 40.0
+_DEFAULT_BOX_PX = 40.0  # where it is not known: that car at 0.14 m a pixel
 
 
 class TargetEstimator:
@@ -181,7 +181,7 @@ class TargetEstimator:
         message = pb.TargetState(**self._header(), state=e.state.value)
         if e.state is not TrackState.LOST:
             message.centre.extend((_clipped(e.x), _clipped(e.y)))
-            message.std_px = min(e.std, _MAX_PIXEL) if math.isfinite(e.std) else 0.0
+            message.std_px = min(e.std, MAX_PIXEL) if math.isfinite(e.std) else 0.0
         if math.isfinite(e.width) and math.isfinite(e.height):
             message.size.extend((_clipped(e.width), _clipped(e.height)))
         if math.isfinite(e.heading):
@@ -204,7 +204,7 @@ class TargetEstimator:
         if outline is None:
             return message
         pixels, ground = outline()
-        valid = np.isfinite(pixels).all(axis=1) & (np.abs(pixels).max(axis=1, initial=0.0) < _MAX_PIXEL)
+        valid = np.isfinite(pixels).all(axis=1) & (np.abs(pixels).max(axis=1, initial=0.0) < MAX_PIXEL)
         chosen = np.flatnonzero(valid)
         chosen = chosen[:: max(1, -(-len(chosen) // _MAX_ROAD_POINTS))]
         message.pixels.extend(pixels[chosen].ravel())
@@ -222,13 +222,13 @@ def decode_image(message: pb.FlightImage) -> Image | None:
 
 
 def _clipped(value: float) -> float:
-    return float(np.clip(value, -_MAX_PIXEL, _MAX_PIXEL))
+    return float(np.clip(value, -MAX_PIXEL, MAX_PIXEL))
 
 
 def _finite_pixels(pixels: Floats) -> Floats:
     """Those of the pixels (n, 2) that are finite and within the representable range."""
     with np.errstate(invalid="ignore"):
-        valid = np.isfinite(pixels).all(axis=1) & np.asarray((np.abs(pixels) < _MAX_PIXEL).all(axis=1))
+        valid = np.isfinite(pixels).all(axis=1) & np.asarray((np.abs(pixels) < MAX_PIXEL).all(axis=1))
     return pixels[valid]
 
 

@@ -16,11 +16,11 @@ from edge.uav.timing.telemetry_track import TelemetryTrack
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
-_TIME_CONSTANT_S = 0.5
+_TIME_CONSTANT_S = 0.5  # of the offset's mean: longer ones lag behind the drift, shorter ones keep the attitude's noise
 _MIN_COSINE = 0.6  # between the ray and straight down: for flatter rays a small tilt error is metres
 _ROLL_PITCH_STD_RAD = 0.005  # of an autopilot's roll and pitch
-_MIN_HEIGHT_M = 2.0
-_CAR_CENTRE_HEIGHT_M = 0.7
+_MIN_HEIGHT_M = 2.0  # of the camera: below, an error of the height in metres is as large as the height
+_CAR_CENTRE_HEIGHT_M = 0.7  # above the ground: 0.155 of a car's length of 4.5 m, as the ground tracker takes it
 
 
 def ground_point(ray: Floats, centre: Floats, least_down: float, above: float = 0.0) -> tuple[Floats, float] | None:

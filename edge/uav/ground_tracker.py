@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Telemetry, TrackState
 from edge.uav.ground.image_plane import apply_homography
 from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.ground.overlay_layers import LazyLayers
@@ -32,10 +32,10 @@ from edge.uav.target.state_estimate import estimate_target
 from edge.uav.target.target import Target
 from edge.uav.target.tracklets import Tracklet, Tracklets
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats, Ints
+from protocols.geometry.types import Floats, Image, Ints
 
 _SAMPLE_SIZE = pf.KldSampleSize(cell=(0.6, 0.6), error=0.05, confidence=0.99, min_count=150, max_count=500)
-_INITIAL_COUNT = 400
+_INITIAL_COUNT = 400  # between the bounds of the sample size, which is computed from the next frame on
 _VELOCITY_GAIN = 0.35  # of the nudging towards the motion fit, per frame
 _POSITION_GAIN = 0.2  # the same for the position
 _MIN_ALIGN_DISTANCE = 0.6  # distance travelled before the heading is used, in target lengths

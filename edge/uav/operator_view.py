@@ -5,7 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from edge.uav.base import Estimate, Image, TrackState
+from edge.uav.base import Estimate, TrackState
+from protocols.geometry.types import Image
 
 _COLOURS = {TrackState.VISIBLE: (80, 220, 80), TrackState.COASTING: (0, 170, 255), TrackState.LOST: (60, 60, 230)}
 _PARTICLE = (230, 120, 200)  # BGR

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from edge.devices.base import Image
 from protocols.core.errors import InputError
+from protocols.geometry.types import Image
 
 CLOCK_HZ = 90_000  # RTP's for video (RFC 6184)
 _PACKET_BYTES = 1400  # with IP's and UDP's headers within 1500

@@ -21,9 +21,9 @@ from functools import partial
 from typing import Self
 from urllib.parse import urlsplit
 
-from edge.devices.base import Image
 from edge.video.rtp_encoder import RtpEncoder, is_rtcp
 from protocols.core.errors import InputError
+from protocols.geometry.types import Image
 
 PATH = "/overlay"
 _MAX_VIEWERS = 4  # of the operator's video, 2 Mbit/s each

@@ -39,16 +39,16 @@ class AlternatingLagResult:
     iterations: tuple[Iteration, ...]
 
 
-def estimate_alternately(a: Floats, b: Floats, start_lag: float = 0.0) -> AlternatingLagResult:
+def estimate_alternately(a: Floats, b: Floats) -> AlternatingLagResult:
     """The paper's iteration on two tracks by frame index.
 
     a: (n, 2), b: (m, 2) undistorted pixels; NaN where a frame has no marker. Raises Refused where fewer
     than 8 indices correspond or no epipolar line crosses the other track.
     """
-    points_a, points_b, _ = corresponding_points(a, b, start_lag)
+    points_a, points_b, _ = corresponding_points(a, b, 0.0)
     fundamental = maximum_likelihood_fundamental(points_a, points_b)
     iterations: list[Iteration] = [
-        Iteration(start_lag, np.full(len(a), np.nan), fundamental, _mean_line_distance(fundamental, points_a, points_b))
+        Iteration(0.0, np.full(len(a), np.nan), fundamental, _mean_line_distance(fundamental, points_a, points_b))
     ]
     while len(iterations) < _MAX_ITERATIONS:
         last = iterations[-1]

@@ -198,9 +198,9 @@ class Elimination:
     reduced: BlockSum
 
 
-def eliminate(system: BorderedSystem, damping: float = 0.0) -> Elimination:
-    """Factor A (damped on its diagonal) and form the Schur complement. Raises LinAlgError if not positive definite."""
-    factor = _damped_cholesky(system.band, damping)
+def eliminate(system: BorderedSystem) -> Elimination:
+    """Factor A and form the Schur complement. Raises LinAlgError if not positive definite."""
+    factor = _damped_cholesky(system.band, 0.0)
     parts, grams = [], []
     for rows, columns, block in system.border.parts:
         parts.append((rows, columns, cho_solve_banded(factor[:, rows], block)))

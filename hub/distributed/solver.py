@@ -18,7 +18,7 @@ from hub.bundle.initialisation import Reconstruction, reconstruct_with_known_pos
 from hub.bundle.preprocessing import PreparedSession
 from hub.clocks.clock_graph import ClockGraph
 from hub.distributed.network.association import MAX_GAP_S
-from hub.distributed.network.host import NodeHost
+from hub.distributed.network.host import UPDATE_PERIOD_S, NodeHost
 from hub.distributed.network.in_process_bus import InProcessNetwork
 from hub.distributed.network.marginals import connected_cameras, merge_duplicate_factors, position_stds
 from hub.distributed.network.messages import ControlPoint, SharedObservation
@@ -33,8 +33,6 @@ from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
-_UPDATE_PERIOD_S = 0.1
-"""Time between two updates of each node [s]."""
 _MAX_UPDATES = 600  # of each node: a bound, a minute of them
 _RAW_OBSERVATIONS = 4096
 """Raw observations that a node keeps per neighbour; offline there is more memory than on a camera board."""
@@ -115,11 +113,11 @@ def _run(
         for name, i in number.items()
     }
     network = InProcessNetwork(nodes, {label: sorted(cameras) for label, cameras in watching.items()})
-    due = rows[0].time + _UPDATE_PERIOD_S if rows else 0.0
+    due = rows[0].time + UPDATE_PERIOD_S if rows else 0.0
     for row in rows:
         while row.time >= due:
             network.tick()
-            due = max(due + _UPDATE_PERIOD_S, row.time - 1.0)  # no updates across a gap
+            due = max(due + UPDATE_PERIOD_S, row.time - 1.0)  # no updates across a gap
         network.observe(row)
     network.run_until_converged(_MAX_UPDATES)
     poses, _ = network.poses()

@@ -38,6 +38,7 @@ from protocols.topics import (
     TRACK_SMOOTHED,
     Topic,
 )
+from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "hub"
 _TICK_S = 0.05  # s: of the hub's loop, below a frame at 15 Hz
@@ -259,7 +260,7 @@ def freeze_garbage_collector() -> None:
 
 def rig_message(rig: Rig) -> pb.RigInfo:
     """The message with the rig's gauge and scale information, for the log."""
-    message = pb.RigInfo(schema_version=1, units=rig.units, clock=rig.clock)
+    message = pb.RigInfo(schema_version=SCHEMA_VERSION, units=rig.units, clock=rig.clock)
     for a, b, distance in rig.distances:
         message.distances.append(pb.RigInfo.Distance(camera_a=a, camera_b=b, distance=distance))
     if isinstance(rig.up, str):
@@ -278,7 +279,7 @@ def status_message(
     """The hub's status at ``now``: counters, gauges, and one line of text."""
     state, text = hub.state(now)
     message = pb.AgentStatus(
-        schema_version=1,
+        schema_version=SCHEMA_VERSION,
         agent=agent,
         role=ROLE,
         boot_id=boot,

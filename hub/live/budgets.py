@@ -10,10 +10,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.ranges import MAX_CAMERAS
 from protocols.messages import syncline_pb2 as pb
 
-MAX_CAMERAS = 1024
-"""As many as a calibration message has."""
 _MAX_DETECTIONS = 256
 """Of one frame, those with the highest scores: association compares every one with every track."""
 _ROWS_PER_S, _BURST_ROWS = 8_000.0, 32_000.0

@@ -13,10 +13,8 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
-from protocols.validation.codec import MAX_PAYLOAD
+from protocols.validation.codec import MAX_PAYLOAD, SCHEMA_VERSION
 from protocols.validation.rules import MAX_TEXT
-
-SCHEMA_VERSION = 1  # of the messages
 
 
 def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[str, str]) -> pb.Calibration:

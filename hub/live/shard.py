@@ -13,16 +13,17 @@ from google.protobuf.message import Message
 
 from hub.distributed.merge import merge_calibrations
 from hub.distributed.sharding import OverlapMeter, Pairs, border, split
-from hub.live.budgets import MAX_CAMERAS
 from hub.live.live_hub import LiveHub, merge_rigs
 from hub.live.messages import calibration_from_message, calibration_message
 from hub.tracking.detections import tracked_kind
 from hub.tracking.handover import TrackHandover
 from protocols.core.errors import Refused
+from protocols.core.ranges import MAX_CAMERAS
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import rig_camera_from_info
 from protocols.session.calibration import Calibration
 from protocols.session.rig import Rig
+from protocols.validation.codec import SCHEMA_VERSION
 
 ROLE = "shard"
 """Role under which a hub that shares its site's cameras is announced."""
@@ -234,7 +235,7 @@ class Shard:
             self._use_site(self.site)
 
     def _message(self) -> pb.Shard:
-        message = pb.Shard(schema_version=1, hub=self.name, version=self.version)
+        message = pb.Shard(schema_version=SCHEMA_VERSION, hub=self.name, version=self.version)
         message.groups.extend(pb.Shard.Group(hub=hub, cameras=names) for hub, names in self.groups.items())
         message.overlaps.extend(
             pb.Shard.Overlap(camera_a=a, camera_b=b, seconds=s) for (a, b), s in self._overlaps[self.name].items()
@@ -264,7 +265,7 @@ class Shard:
             boots = of_parts | kept
             message = calibration_message(site, self._revision, boots)
         except Refused as refusal:
-            message = pb.Calibration(schema_version=1, revision=self._revision, status="collecting")
+            message = pb.Calibration(schema_version=SCHEMA_VERSION, revision=self._revision, status="collecting")
             message.reason = refusal.reason
         progress = {one.camera: one for hub, part in parts.items() for one in part.progress
                     if one.camera in self.groups.get(hub, ())}  # fmt: skip

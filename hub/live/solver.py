@@ -78,14 +78,10 @@ class Solver(Protocol):
 
 
 class InlineSolver:
-    """Solves where it is called, for replays and tests; its answers do not depend on time.
+    """Solves where it is called, for replays and tests; its answers do not depend on time."""
 
-    on_submit: called with each job before it is solved.
-    """
-
-    def __init__(self, on_submit: Callable[[SolverJob], None] | None = None) -> None:
+    def __init__(self) -> None:
         self._answer: SolverAnswer | None = None
-        self._on_submit = on_submit
 
     @property
     def busy(self) -> bool:
@@ -94,8 +90,6 @@ class InlineSolver:
 
     def submit(self, job: SolverJob, now: float) -> None:
         """Solve the job."""
-        if self._on_submit is not None:
-            self._on_submit(job)
         self._answer = run_job(job, cpu_clock=lambda: 0.0)
 
     def poll(self, now: float) -> SolverAnswer | None:

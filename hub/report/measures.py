@@ -145,8 +145,8 @@ def spans(time: Floats, gap: float = 2 * SEEN_WITHIN) -> list[Span]:
     return [(float(a), float(b)) for a, b in zip(begins, ends, strict=True)]
 
 
-def shared_spans(seen: list[list[Span]], at_least: int = 2, reach: float = SEEN_WITHIN) -> list[Span]:
-    """Intervals in which at least ``at_least`` cameras saw the point within ``reach`` seconds."""
+def shared_spans(seen: list[list[Span]], reach: float = SEEN_WITHIN) -> list[Span]:
+    """Intervals in which at least two cameras saw the point within ``reach`` seconds."""
     events: list[tuple[float, int]] = []
     for camera in seen:
         for begin, end in camera:
@@ -155,9 +155,9 @@ def shared_spans(seen: list[list[Span]], at_least: int = 2, reach: float = SEEN_
     count, begin = 0, 0.0
     for time, change in sorted(events, key=lambda event: (event[0], -event[1])):
         before, count = count, count + change
-        if before < at_least <= count:
+        if before < 2 <= count:
             begin = time
-        elif before >= at_least > count and time > begin:
+        elif before >= 2 > count and time > begin:
             out.append((begin, time))
     return out
 

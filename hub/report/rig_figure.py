@@ -22,7 +22,7 @@ Rows = Sequence[Sequence[float | None]]
 
 MOST_POINTS = 3000  # of the trajectory: the page stays below 6 MB
 _BREAK = 0.5  # a trajectory is not drawn across a longer gap [s]
-_NAVY, _ORANGE, _GREY = "#123a5f", "#c2510a", "#667"
+_NAVY, _ORANGE = "#123a5f", "#c2510a"
 DIV = "scene-3d"
 
 

@@ -87,9 +87,9 @@ def line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
     return f'<line class="{kind}" x1="{at(x1)}" y1="{at(y1)}" x2="{at(x2)}" y2="{at(y2)}"/>'
 
 
-def rect(x: float, y: float, width: float, height: float, kind: str, title: str = "", extra: str = "") -> str:
+def rect(x: float, y: float, width: float, height: float, kind: str, title: str = "") -> str:
     """A rectangle with an optional tooltip."""
-    shape = f'<rect class="{kind}" x="{at(x)}" y="{at(y)}" width="{at(width)}" height="{at(height)}"{extra}'
+    shape = f'<rect class="{kind}" x="{at(x)}" y="{at(y)}" width="{at(width)}" height="{at(height)}"'
     return f"{shape}><title>{esc(title)}</title></rect>" if title else f"{shape}/>"
 
 
@@ -110,12 +110,10 @@ def drawing(width: float, height: float, parts: Iterable[str], label: str, max_w
     return f"{frame}{''.join(parts)}</svg>"
 
 
-def time_axis(
-    low: float, high: float, left: float, width: float, top: float, bottom: float, about: int = 8
-) -> list[str]:
+def time_axis(low: float, high: float, left: float, width: float, top: float, bottom: float) -> list[str]:
     """Grid lines and labels of a horizontal axis in seconds."""
     parts = []
-    values = ticks(low, high, about)
+    values = ticks(low, high, 8)
     for value in values:
         x = left + width * (value - low) / max(high - low, 1e-12)
         parts.append(line(x, top, x, bottom, "grid"))

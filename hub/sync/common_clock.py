@@ -20,17 +20,14 @@ _SEEDS = 4  # of RANSAC: one may end in a local minimum
 
 
 def solve_common_clock_pair(
-    tracks_a: Mapping[str, ImageTrack],
-    tracks_b: Mapping[str, ImageTrack],
-    names: tuple[str, str],
-    settings: PairSettings | None = None,
+    tracks_a: Mapping[str, ImageTrack], tracks_b: Mapping[str, ImageTrack], names: tuple[str, str]
 ) -> PairSolution:
     """Relative pose from the rows of equal time of all labels: five-point RANSAC, then the Sampson distance.
 
     tracks_a, tracks_b: by label. names: of the two cameras. A pair without an acceptable pose is returned unsolved,
     with the reason. Support is counted as if rows came at 10 Hz.
     """
-    s = settings or PairSettings()
+    s = PairSettings()
     parts_a, parts_b, times = [], [], []
     for label, a in tracks_a.items():
         if label in tracks_b:

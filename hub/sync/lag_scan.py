@@ -21,7 +21,7 @@ from protocols.geometry import kernels
 from protocols.geometry.order_statistics import median, quantile
 from protocols.geometry.types import Bools, Floats, Ints
 
-_MONOMIALS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_MONOMIALS = 6  # of two homogeneous coordinates
 MONOMIAL_INDEX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Index of the product of two homogeneous coordinates among the six monomials (x², xy, x, y², y, 1)."""
 _MONOMIAL_OF_A, _MONOMIAL_OF_B = (MONOMIAL_INDEX[np.ix_(index, index)] for index in np.divmod(np.arange(9), 3))
@@ -140,7 +140,7 @@ class PairMoments:
         common = self._weight[self.lags % self._length]
         self.support: Floats = np.asarray(np.maximum(common, 0.0) * a.step, dtype=np.float64)
         self._column = np.full(len(self.lags), -1, dtype=np.int64)
-        self._moments = np.zeros((len(_MONOMIALS), len(_MONOMIALS), 0))
+        self._moments = np.zeros((_MONOMIALS, _MONOMIALS, 0))
 
     def _correlation(self, of_a: NDArray[np.complex128], of_b: NDArray[np.complex128]) -> Floats:
         """c[lag] = sum_n a[n] b[n + lag], summed over labels; negative lags from the end.
@@ -161,10 +161,10 @@ class PairMoments:
         missing = which[self._column[which] < 0]
         if len(missing):
             place = self.lags[missing] % self._length
-            fresh = np.empty((len(_MONOMIALS), len(_MONOMIALS), len(missing)))
+            fresh = np.empty((_MONOMIALS, _MONOMIALS, len(missing)))
             spectra_a = np.conj(rfft(monomials(self.a), self._length))
             spectra_b = rfft(monomials(self.b), self._length)
-            for i in range(len(_MONOMIALS)):
+            for i in range(_MONOMIALS):
                 fresh[i] = self._correlation(spectra_a[:, i], spectra_b).take(place, axis=1)
             self._column[missing] = self._moments.shape[2] + np.arange(len(missing))
             self._moments = np.concatenate([self._moments, fresh], axis=2) if self._moments.size else fresh
@@ -193,9 +193,9 @@ class PairMoments:
         """Mean squared distance over the squared noise (m,) under a given ``m_aᵀ F m_b = 0`` at lags ``which``."""
         theta = to_grid_coordinates(matrix, self.a, self.b).reshape(3, 3)
         plane = np.diag([1.0, 1.0, 0.0])
-        of_both, each = (len(_MONOMIALS) * _MONOMIAL_OF_A + _MONOMIAL_OF_B).ravel(), MONOMIAL_INDEX.ravel()
-        misfit = np.bincount(of_both, np.outer(theta, theta).ravel(), len(_MONOMIALS) ** 2)
-        misfit = misfit.reshape(len(_MONOMIALS), -1)
+        of_both, each = (_MONOMIALS * _MONOMIAL_OF_A + _MONOMIAL_OF_B).ravel(), MONOMIAL_INDEX.ravel()
+        misfit = np.bincount(of_both, np.outer(theta, theta).ravel(), _MONOMIALS**2)
+        misfit = misfit.reshape(_MONOMIALS, -1)
         of_b = np.bincount(each, (self.a.sigma**2 * theta.T @ plane @ theta).ravel())
         of_a = np.bincount(each, (self.b.sigma**2 * theta @ plane @ theta.T).ravel())
         chosen = self.moment_sums(which)
@@ -333,7 +333,7 @@ def to_grid_coordinates(matrix: Floats, a: GridTrack, b: GridTrack) -> Floats:
 def monomials(track: GridTrack) -> Floats:
     """(labels, 6, n): weight times the six monomials of the homogeneous coordinates."""
     x, y = track.points[:, :, 0], track.points[:, :, 1]
-    out = np.empty((len(x), len(_MONOMIALS), x.shape[1]))
+    out = np.empty((len(x), _MONOMIALS, x.shape[1]))
     out[:, 2], out[:, 4], out[:, 5] = track.weight * x, track.weight * y, track.weight
     out[:, 0], out[:, 1], out[:, 3] = out[:, 2] * x, out[:, 2] * y, out[:, 4] * y
     return out

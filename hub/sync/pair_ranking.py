@@ -15,7 +15,6 @@ _COARSENING = 8.0  # times the grid step of the full scan
 def ranking_score(
     tracks_a: Mapping[str, SmoothTrack],
     tracks_b: Mapping[str, SmoothTrack],
-    settings: PairSettings | None = None,
     cache: TrackCache | None = None,
 ) -> float:
     """Ranking score of a pair: the best candidate's score (`lag_scan.ranked_minima`) in a coarse scan of all lags.
@@ -23,7 +22,7 @@ def ranking_score(
     Only for the order in which pairs are solved; 0 without common labels or candidates. cache: grids that other pairs
     of these cameras have computed.
     """
-    s, cache = settings or PairSettings(), cache or TrackCache()
+    s, cache = PairSettings(), cache or TrackCache()
     labels = [label for label in tracks_a if label in tracks_b]
     if not labels:
         return 0.0

@@ -58,7 +58,7 @@ _HARDLY_MOVES_AT_PREDICTED_LAG = (
 )
 _NO_FIT_AT_PREDICTED_LAG = "no geometry agrees at the lag that the other cameras imply; other lags were not searched"
 _NONE_RELIABLE = "none of the most promising lags fits; further ones were not searched"
-_MAX_STARTS = 4
+_MAX_STARTS = 4  # hypotheses that are refined whatever they cost, best first
 _FIVE_POINT_SEEDS = 8  # random seeds of five-point hypotheses; more than _MAX_STARTS hypotheses are tried only …
 _PROMISING = 12.0  # … while the cost is at most this many times the noise: a local minimum of E at the right lag
 _MAX_RATE_STEPS = 8  # drift rates tried on either side of 1
@@ -77,10 +77,10 @@ _MAX_RATE_BLIND_SPAN = (
 _MAX_COST_RATIO = 0.2  # of the median cost of lags with similar support
 _SAME_LAG = 0.1  # s
 _MAX_REPETITIONS = 4  # other lags at which the solution's own geometry is tried
-_FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)  # common ones [1/s]
+FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)  # common ones [1/s]
 FRAME_RATE_RATIOS = tuple(
     sorted(
-        {round(a / b, 9) for a in _FRAME_RATES for b in _FRAME_RATES if 0.4 < a / b < 2.5 and a != b},
+        {round(a / b, 9) for a in FRAME_RATES for b in FRAME_RATES if 0.4 < a / b < 2.5 and a != b},
         key=lambda rate: abs(np.log(rate)),
     )
 )
@@ -559,9 +559,7 @@ def _peaks(offset: Floats, value: Floats, max_candidates: int) -> list[int]:
     return out
 
 
-def evaluate_alignment(
-    a: SmoothTrack, b: SmoothTrack, offset: float, pose: RelativePose, settings: PairSettings | None = None
-) -> PairFit:
+def evaluate_alignment(a: SmoothTrack, b: SmoothTrack, offset: float, pose: RelativePose) -> PairFit:
     """Quality figures of an alignment ``t_a = t_b + offset`` [s] that another method estimated."""
-    s = settings or PairSettings()
+    s = PairSettings()
     return Samples([a], [b], offset, s, s.refinement_samples).evaluate(0.0, 1.0, offset, pose)

@@ -132,9 +132,7 @@ class FrameDetections:
         return replace(self, point=points[0], head=points[1], foot=points[2])
 
 
-def frame_detections(
-    camera: TrackingCamera, message: pb.Observation, reference_ns: int | None = None
-) -> FrameDetections:
+def frame_detections(camera: TrackingCamera, message: pb.Observation) -> FrameDetections:
     """The trackable detections of an observation; those that cannot be undistorted are left out."""
     found = [detection for detection in message.detections if tracked_kind(detection)]
     pixel_pairs = [((d.u, d.v), _pixel_or_nan(d.head), _pixel_or_nan(d.foot)) for d in found]
@@ -156,7 +154,7 @@ def frame_detections(
     colour = [(d.colour.red, d.colour.green, d.colour.blue) if d.HasField("colour") else (np.nan,) * 3 for d in found]
     return FrameDetections(
         camera=camera,
-        reference_ns=camera.reference_ns(message.device_time_ns) if reference_ns is None else reference_ns,
+        reference_ns=camera.reference_ns(message.device_time_ns),
         boot_id=message.boot_id,
         sequence=message.sequence,
         point=point,

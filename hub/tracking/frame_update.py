@@ -43,7 +43,7 @@ from hub.tracking.filter.manoeuvre import (
 )
 from hub.tracking.filter.measurement import PredictedMeasurement, measurements_of, predict_measurement
 from hub.tracking.filter.prediction import predict_targets
-from hub.tracking.filter.target_models import KIND_INDEX, TARGET_MODELS
+from hub.tracking.filter.target_models import KIND_INDEX, TARGET_MODELS, UPRIGHT
 from hub.tracking.filter.target_states import DetectionStatistics, MultiTargetState, Scan, ScanFrame, Targets
 from hub.tracking.parameters import TrackerParameters, track_label
 from hub.tracking.track_management import MAX_EXISTENCE, initiate_tracks, manage_tracks, with_floor_of, with_overlap
@@ -57,8 +57,7 @@ _BIRTH_SPREAD_M, _BIRTH_EXISTENCE = 5.0, 0.1
 """Std of a new target's position, and its probability, before anything is measured of it."""
 _MANOEUVRING = 0.8
 """Probability of detecting a target that may manoeuvre inside its gate."""
-_MIN_COLOUR_GAIN = 0.02
-_UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
+_MIN_COLOUR_GAIN = 0.02  # a mean over 50 detections: colours change with place and light
 
 
 def process_frame(
@@ -100,7 +99,7 @@ def process_frame(
 def on_floor(targets: Targets, floor: Floor | None, elapsed: Floats | float) -> Targets:
     """Upright targets with their feet on the floor, where it is known; ``elapsed`` (n,) or all, since the last time."""
     elapsed = np.broadcast_to(elapsed, (len(targets),))
-    standing = np.flatnonzero(_UPRIGHT[targets.kind] & (elapsed > 0.0))
+    standing = np.flatnonzero(UPRIGHT[targets.kind] & (elapsed > 0.0))
     if floor is None or not floor.known or not len(standing):
         return targets
     mean, covariance = targets.mean.copy(), targets.covariance.copy()
@@ -181,7 +180,7 @@ def _associate_and_update(
     visible = visible_fraction(frame.camera, predicted)
     probability = detection_probability(statistics, visible, occluded)
     # A target that changes its velocity abruptly leaves its gate for a few frames: that is no evidence against it.
-    leaves = can_manoeuvre(targets) & ~_UPRIGHT[targets.kind]
+    leaves = can_manoeuvre(targets) & ~UPRIGHT[targets.kind]
     probability = np.where(leaves, np.minimum(probability, _MANOEUVRING), probability)
     row, column, nis, beside, ambiguous = none, none, np.zeros(0), none.astype(np.bool_), False
     detected, clutter = np.zeros(len(targets)), np.ones(len(frame))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from google.protobuf.message import Message
@@ -33,18 +33,8 @@ _UP_EVERY_FRAMES = 20  # the vertical is estimated again
 _WAIT = 0.25
 """Of a frame interval above ``_SLOW_S``: how long an instant's other cameras are awaited after the last arrival."""
 _SLOW_S = 0.2  # s behind, from which tracking is reported as slow
-
-
-@dataclass(frozen=True, slots=True)
-class TrackingSettings:
-    """interval_s: between two publications. lag_s: how much later than another camera's an observation may arrive.
-
-    ahead_s: prediction horizon after the newest frame.
-    """
-
-    interval_s: float = 0.05
-    lag_s: float = 0.5
-    ahead_s: float = 0.1
+_INTERVAL_S, _AHEAD_S = 0.05, 0.1  # between two publications; prediction horizon after the newest frame
+_LAG_S = 0.5  # how much later than another camera's an observation may arrive
 
 
 class LiveTracking:
@@ -53,9 +43,8 @@ class LiveTracking:
     Markers with a label are tracked by it (`MarkerTracks`), all else by association (`Tracker`).
     """
 
-    def __init__(self, settings: TrackingSettings | None = None) -> None:
-        self.settings = settings or TrackingSettings()
-        self.tracker = Tracker(lag_s=self.settings.lag_s)
+    def __init__(self) -> None:
+        self.tracker = Tracker(lag_s=_LAG_S)
         self._vertical = VerticalEstimator()
         self._given_up: Floats | None = None
         self._scale = LengthScale()
@@ -73,7 +62,7 @@ class LiveTracking:
         self._used_frames = 0
         self._clock: tuple[str, str] | None = None
         self.has_detections = False
-        self.markers = MarkerTracks(self.settings.lag_s, self.tracker.parameters.coast_s, self.settings.interval_s)
+        self.markers = MarkerTracks(_LAG_S, self.tracker.parameters.coast_s, _INTERVAL_S)
         self._smoothed = 0
 
     @property
@@ -172,14 +161,14 @@ class LiveTracking:
         slow = state.interval_s > _SLOW_S
         if slow and not state.scan_complete and now - self._seen_at < _WAIT * state.interval_s:
             return []  # at few frames a second, the cameras of an instant are awaited
-        self._next, self._published_steps = now + self.settings.interval_s, steps
+        self._next, self._published_steps = now + _INTERVAL_S, steps
         published_ns, self._published_ns = self._published_ns, state.time_ns
-        every_ns = round(self.settings.interval_s * NANOSECONDS)
+        every_ns = round(_INTERVAL_S * NANOSECONDS)
         # If a busy machine delayed the hub, the missed times are published now, so that tracks have no gaps.
         states_since = [] if published_ns is None else self.tracker.states_since(published_ns, every_ns)
         self._update_scale()
         out: list[Message] = [track for each in (*states_since, state) for track in self._tracks(each)]
-        ahead = state.time_ns + round(self.settings.ahead_s * NANOSECONDS)
+        ahead = state.time_ns + round(_AHEAD_S * NANOSECONDS)
         cameras, parameters = self.tracker.cameras, self.tracker.parameters
         number, self._predictions = self._predictions, self._predictions + 1
         if self.predicts:

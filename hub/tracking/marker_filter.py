@@ -24,7 +24,7 @@ from protocols.geometry.types import Floats
 _PSD_STEP = 10.0
 """Between the densities of neighbouring filters: the bandwidth goes with the sixth root, so 1.5 times."""
 _BANK = (1.0 / _PSD_STEP, 1.0, _PSD_STEP)
-_MOVE_WEIGHT = 0.7
+_MOVE_WEIGHT = 0.7  # of an outermost filter: less moves by chance from equal ones' thirds, more follows manoeuvres late
 _MEMORY_S = 1.0
 """Time constant of the forgetting of past innovations."""
 _GATE = 18.4
@@ -40,7 +40,7 @@ _CONFIRM_HITS = 10
 """Accepted rows, with the six of the first state."""
 _TRY_EVERY_NS = 40_000_000
 """Between two attempts to begin a track, each as costly as several rows."""
-_USUAL_GAIN = 0.05
+_USUAL_GAIN = 0.05  # of a row: a mean over 20
 _COASTING_STD = 3.0
 """Times the usual std: then one std is as large as errors ever are while two cameras see the marker."""
 

@@ -11,16 +11,15 @@ from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.filter.measurement import POINT, predict_measurement
 from hub.tracking.filter.target_models import MARKER, TARGET_MODELS
 from hub.tracking.filter.target_states import Targets
-from hub.tracking.marker_filter import MarkerState
+from hub.tracking.marker_filter import RECENT_NS, MarkerState
 from hub.tracking.parameters import TrackerParameters, track_label
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
+from protocols.validation.codec import SCHEMA_VERSION
 
-SCHEMA_VERSION = 1  # of the messages
-_COASTING_AFTER_S = 0.35
-MARKER_COASTING_AFTER_S = 0.2
-_RECENT_NS = 500_000_000
+_COASTING_AFTER_S = 0.35  # three frames missed at 10 fps
+MARKER_COASTING_AFTER_S = 0.2  # six frames missed at 30 fps
 _MIN_HEADING_SPEED_M_S = 0.25
 """Targets slower than this have no heading."""
 _HEAD_HEIGHT, _HEAD_WIDTH = 0.16, 0.13
@@ -52,7 +51,7 @@ def track_messages(
             position_covariance=covariance[POSITION, POSITION].ravel().tolist(),
             velocity_covariance=covariance[VELOCITY, VELOCITY].ravel().tolist(),
             kind=model.kind,
-            cameras=int((targets.seen_by[i] > time_ns - _RECENT_NS).sum()),
+            cameras=int((targets.seen_by[i] > time_ns - RECENT_NS).sum()),
             unseen_s=unseen,
         )
         if np.isfinite(angles[i]):

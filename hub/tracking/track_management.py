@@ -11,7 +11,7 @@ from hub.tracking.association.reidentification import reidentify, store_lost_tra
 from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION
-from hub.tracking.filter.target_models import TARGET_MODELS
+from hub.tracking.filter.target_models import UPRIGHT
 from hub.tracking.filter.target_states import MultiTargetState, Targets
 from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
@@ -19,7 +19,7 @@ from protocols.geometry.types import Bools, Floats
 
 _INITIATION_WINDOW_NS = 250_000_000
 """Detections older than the frame by more than this are not used for track initiation with it."""
-_MAX_ANCHORS = 4
+_MAX_ANCHORS = 4  # each costs a fit: bounds a frame full of clutter
 _ARRIVALS = 0.1
 """People expected to appear in a frame."""
 _MAX_TENTATIVE = 64  # bounds the cost of a frame of clutter
@@ -31,8 +31,7 @@ _MIN_HITS = 2  # two: one may be clutter
 _ALONE_S = 1.0
 """Age from which on a person on the floor whom one camera alone sees is confirmed: a part of the background that was
 taken for somebody is learned by then."""
-_TENTATIVE_S = 0.5
-_UNSEEN_S = 0.5
+_UNSEEN_S = 0.5  # without a detection: five frames at 10 fps, and at least one and a half of slower cameras
 _SAME_TARGET_RADIUS = 0.3
 """As a fraction of the size: a candidate nearer than this to a target is that target; two targets within half of it
 are duplicates."""
@@ -44,7 +43,6 @@ _MAX_OVERLAP, _MIN_OVERLAP = 3.0, -6.0
 """Log likelihood ratio from which on two tracks are one person (20 to 1), and its limit below."""
 _FLOOR_GATE = 0.25
 """Of a foot's height above the floor, as a fraction of the size."""
-_UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 
 
 def with_floor_of(state: MultiTargetState, parameters: TrackerParameters) -> MultiTargetState:
@@ -63,7 +61,7 @@ def initiate_tracks(
     """New tracks from unassociated detections: of this frame alone where the floor is known, else of two cameras."""
     name = frame.camera.name
     own = state.unassociated.get(name, ())
-    upright = [one for one in own if _UPRIGHT[one.kind]]
+    upright = [one for one in own if UPRIGHT[one.kind]]
     state = _with_views(state, upright, name, cameras, parameters)
     if state.floor is not None and state.floor.known and upright:
         clutter = state.statistics[name].clutter
@@ -71,14 +69,13 @@ def initiate_tracks(
         arrivals = max(_ARRIVALS, len(upright) - clutter - 3.0 * np.sqrt(clutter))
         born = [candidate_on(state.floor, one, parameters.scale, arrivals / clutter) for one in upright]
         state = _with_candidates(state, [one for one in born if one is not None], parameters)
-        own = tuple(one for one in own if not _UPRIGHT[one.kind])
+        own = tuple(one for one in own if not UPRIGHT[one.kind])
         state = replace(state, unassociated={**state.unassociated, name: own})
     live = [other for other, time in state.last_frame_ns.items() if frame.reference_ns - time <= _INITIATION_WINDOW_NS]
     unassociated = {other: state.unassociated.get(other, ()) for other in live}
     recent_cameras = {other: cameras[other] for other in live if other in cameras}
     if not own or not any(unassociated[other] for other in live if other != name):
         return state
-    # The number of anchors is limited, so that a frame full of clutter costs no more than a few fits.
     every = [
         best_candidate(anchor, unassociated, recent_cameras, parameters.up, parameters.scale)
         for anchor in own[:_MAX_ANCHORS]
@@ -128,7 +125,7 @@ def _with_candidates(
 def _is_new(state: MultiTargetState, candidate: TrackCandidate, parameters: TrackerParameters) -> bool:
     """Whether a candidate is no known target, and stands on the floor on which others stand."""
     size = float(np.exp(candidate.mean[LOG_SIZE]))
-    up = parameters.up if _UPRIGHT[candidate.detections[0].kind] else None
+    up = parameters.up if UPRIGHT[candidate.detections[0].kind] else None
     if len(state.targets):
         distance = np.linalg.norm(state.targets.mean[:, POSITION] - candidate.mean[POSITION], axis=1)
         spread = np.sqrt(np.trace(candidate.covariance[POSITION, POSITION]))
@@ -200,7 +197,7 @@ def manage_tracks(state: MultiTargetState, elapsed: float, parameters: TrackerPa
     now = state.time_ns
     assert now is not None
     cameras = (targets.seen_by > now - recent_ns).sum(axis=1)
-    placed = _UPRIGHT[targets.kind] & (state.floor is not None and state.floor.known)
+    placed = UPRIGHT[targets.kind] & (state.floor is not None and state.floor.known)
     placed &= now - targets.born_ns >= _ALONE_S * NANOSECONDS
     ready = (targets.existence >= _CONFIRMED) & (targets.hits >= _MIN_HITS) & ((cameras >= 2) | placed)
     state = reidentify(state, ~targets.confirmed & ready, parameters)
@@ -209,9 +206,9 @@ def manage_tracks(state: MultiTargetState, elapsed: float, parameters: TrackerPa
     known = targets.confirmed
     size = np.exp(targets.mean[:, LOG_SIZE])
     spread = np.sqrt(np.trace(targets.covariance[:, POSITION, POSITION], axis1=1, axis2=2))
-    max_spread = np.where(_UPRIGHT[targets.kind], 2.0 * size, 2.5 * parameters.scale.units_per_m)
+    max_spread = np.where(UPRIGHT[targets.kind], 2.0 * size, 2.5 * parameters.scale.units_per_m)
     drop = targets.existence < _DELETED
-    drop |= ~known & (unseen > max(_TENTATIVE_S, 1.5 * state.interval_s))
+    drop |= ~known & (unseen > max(_UNSEEN_S, 1.5 * state.interval_s))
     drop |= known & ((unseen > parameters.coast_s) | ((unseen > recent_ns / NANOSECONDS) & (spread > max_spread)))
     drop |= _off_floor(state, recent_ns)
     drop |= _duplicates(targets, size) | (targets.overlap > _MAX_OVERLAP)
@@ -229,7 +226,7 @@ def _with_feet(state: MultiTargetState, elapsed: float, recent_ns: int) -> Multi
     targets, floor, now = state.targets, state.floor, state.time_ns
     if floor is None or now is None or elapsed <= 0.0:
         return state
-    standing = targets.confirmed & _UPRIGHT[targets.kind] & (targets.seen_ns == now)
+    standing = targets.confirmed & UPRIGHT[targets.kind] & (targets.seen_ns == now)
     standing &= (targets.seen_by > now - recent_ns).sum(axis=1) >= 2
     if not standing.any():
         return state
@@ -244,7 +241,7 @@ def _off_floor(state: MultiTargetState, recent_ns: int) -> Bools:
     if floor is None or now is None or not floor.known:
         return np.zeros(len(targets), dtype=np.bool_)
     few = (targets.seen_by > now - recent_ns).sum(axis=1) < 3
-    return np.asarray(_UPRIGHT[targets.kind] & few & _off(floor, targets.mean))
+    return np.asarray(UPRIGHT[targets.kind] & few & _off(floor, targets.mean))
 
 
 def with_overlap(
@@ -261,7 +258,7 @@ def with_overlap(
     offset = offset - (offset @ parameters.up)[..., None] * parameters.up
     distance = np.linalg.norm(offset, axis=2)
     order = np.where(targets.confirmed, 0, 2**40) + targets.initiation_number
-    upright = _UPRIGHT[targets.kind]
+    upright = UPRIGHT[targets.kind]
     older = upright[:, None] & upright[None, :] & (order[None, :] < order[:, None])
     distance = np.where(older, distance, np.inf)
     other = distance.argmin(axis=1)
@@ -287,7 +284,7 @@ def _duplicates(targets: Targets, size: Floats) -> Bools:
         return np.zeros(n, dtype=np.bool_)
     offset = np.linalg.norm(targets.mean[:, None, POSITION] - targets.mean[None, :, POSITION], axis=2)
     near = (offset < 0.5 * _SAME_TARGET_RADIUS * size[:, None]) & (targets.kind[:, None] == targets.kind[None, :])
-    near &= _UPRIGHT[targets.kind][:, None]  # the size of other kinds may be unknown
+    near &= UPRIGHT[targets.kind][:, None]  # the size of other kinds may be unknown
     older = (targets.number[None, :] > 0) & (
         (targets.number[:, None] == 0) | (targets.number[None, :] < targets.number[:, None])
     )

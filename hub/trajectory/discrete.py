@@ -104,15 +104,13 @@ class SampledTrack:
         return float(self.time[-1] - self.time[0])
 
 
-def sampled_track(
-    time: Floats, normalised: Floats, focal: float, time_origin: float, sigma_px: float = 0.5
-) -> SampledTrack | None:
+def sampled_track(time: Floats, normalised: Floats, focal: float, time_origin: float) -> SampledTrack | None:
     """The rows unchanged; None if the lens model can undistort none of them."""
     good = np.asarray(np.isfinite(normalised).all(axis=1))
     if not good.any():
         return None
     shifted = time[good] - time_origin
-    return SampledTrack(time_origin, shifted, normalised[good], good, PointBasis(shifted), sigma_px / focal, focal)
+    return SampledTrack(time_origin, shifted, normalised[good], good, PointBasis(shifted), 0.5 / focal, focal)
 
 
 def find_instants(instants: Floats, time: Floats) -> tuple[Ints, Bools]:

@@ -39,20 +39,19 @@ def eight_point(a: Floats, b: Floats) -> Floats:
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
-def maximum_likelihood_fundamental(a: Floats, b: Floats, start: Floats | None = None, iterations: int = 50) -> Floats:
+def maximum_likelihood_fundamental(a: Floats, b: Floats) -> Floats:
     """Maximum-likelihood F (3, 3), norm 1: minimises the Sampson distance of point pairs a, b (n, 2).
 
-    start: (3, 3); default the eight-point solution. Raises Refused for fewer than 8 pairs.
+    It starts from the eight-point solution. Raises Refused for fewer than 8 pairs.
     """
     from scipy.optimize import least_squares  # slow to import, and needed by the papers' methods only
 
-    first = eight_point(a, b) if start is None else start
     # In normalised coordinates, with the ratio of scales kept so that the Sampson distance is in pixels of one size.
     ta, tb = hartley_normalisation(a), hartley_normalisation(b)
     inverse_scale = ta[0, 0] / tb[0, 0]
     ha = np.column_stack([a, np.ones(len(a))]) @ ta.T
     hb = np.column_stack([b, np.ones(len(b))]) @ tb.T
-    u, d, vt = np.linalg.svd(np.linalg.inv(ta).T @ first @ np.linalg.inv(tb))
+    u, d, vt = np.linalg.svd(np.linalg.inv(ta).T @ eight_point(a, b) @ np.linalg.inv(tb))
     u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
     angle = np.arctan2(d[1], d[0])
 
@@ -66,7 +65,7 @@ def maximum_likelihood_fundamental(a: Floats, b: Floats, start: Floats | None = 
         variance = (la[:, :2] ** 2).sum(1) * inverse_scale**2 + (lb[:, :2] ** 2).sum(1)
         return np.asarray((ha * la).sum(1) / np.sqrt(np.maximum(variance, 1e-300)))
 
-    found = least_squares(residuals, np.zeros(7), "3-point", xtol=1e-12, ftol=1e-12, gtol=None, max_nfev=iterations)
+    found = least_squares(residuals, np.zeros(7), "3-point", xtol=1e-12, ftol=1e-12, gtol=None, max_nfev=50)
     matrix = ta.T @ compose(found.x) @ tb
     return np.asarray(matrix / np.linalg.norm(matrix))
 

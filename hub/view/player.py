@@ -32,6 +32,7 @@ from protocols.topics import (
     TRACK,
     UAV_INFO,
 )
+from protocols.validation.codec import SCHEMA_VERSION
 
 CONTEXT_S = 20.0
 """After a seek, messages of this many seconds before are replayed; latched messages are known from the beginning."""
@@ -185,7 +186,7 @@ class Player:
 def _info(calibration: Calibration, name: str) -> pb.CameraInfo:
     lens = calibration.cameras[name].intrinsics
     return pb.CameraInfo(
-        schema_version=1,
+        schema_version=SCHEMA_VERSION,
         camera=name,
         width=lens.width,
         height=lens.height,

@@ -7,12 +7,9 @@ import itertools
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from hub.view.uav_state import UavView
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Floats, Image
 
 _MARGIN = 0.35
 """Canvas margin on each side as a fraction of the image: within it an estimate outside the image is drawn at its

@@ -31,5 +31,7 @@ MAX_EXPOSURE_NS = 3_600 * 10**9
 """ns. An hour; astronomers expose for minutes."""
 MIN_CLOCK_RATE, MAX_CLOCK_RATE = 1e-3, 1e3
 """Seconds of one clock in a second of another. Slow motion of 1,000 times, slower or faster."""
+MAX_CAMERAS = 1024
+"""Of a rig, a hub and a message: more are split among several."""
 MAX_COUNT = 2**53
 """Of frames and messages: what a double counts exactly. 4,000 years at 100,000 Hz."""

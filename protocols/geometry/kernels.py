@@ -13,11 +13,9 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-import numpy.typing as npt
 
-from protocols.geometry.types import Bools, Floats, Ints
+from protocols.geometry.types import Bools, Floats, Ints, Singles
 
-Singles = npt.NDArray[np.float32]
 _KINDS = {"n": c_int64, "d": c_double, "p": c_void_p}
 _SIGNATURES = {
     "spline_weights": "npnpdpppp",

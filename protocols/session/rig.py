@@ -14,6 +14,7 @@ from protocols.core.errors import InputError
 from protocols.core.files import read_toml, toml_line
 from protocols.core.names import check_name, is_name
 from protocols.core.ranges import (
+    MAX_CAMERAS,
     MAX_DISTORTION,
     MAX_FOCAL,
     MAX_FPS,
@@ -170,10 +171,6 @@ class _Table:
         return None if array is None else np.where(array < MIN_STD, 0.0, array)
 
 
-_MAX_CAMERAS = 1024
-"""As many as messages have."""
-
-
 def read_rig(file: Path) -> Rig:
     """Read rig.toml (or a calibration.toml, which holds the same tables and more).
 
@@ -190,8 +187,8 @@ def parse_rig(values: dict[str, Any], file: Path, text: str) -> Rig:
     if not isinstance(metadata, dict):
         raise InputError("metadata is not a table", file=file, remedy="write [metadata] and its keys below it")
     meta = _Table(metadata, "metadata", file, text)
-    if len(values) > _MAX_CAMERAS:
-        raise InputError(f"{len(values)} cameras, at most {_MAX_CAMERAS}", file=file, remedy="split the rig")
+    if len(values) > MAX_CAMERAS:
+        raise InputError(f"{len(values)} cameras, at most {MAX_CAMERAS}", file=file, remedy="split the rig")
     for name, table in values.items():
         if not isinstance(table, dict):
             raise InputError(

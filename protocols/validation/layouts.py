@@ -28,7 +28,7 @@ from protocols.geometry.types import Ints
 
 _MAX_SIZE = 4096
 """Bytes of a message that is worth a layout: thirty people with all their fields."""
-_MAX_LAYOUTS, _MAX_OF_SIZE = 512, 4
+_MAX_LAYOUTS, _MAX_OF_SIZE = 512, 4  # until all are made anew; that are tried for messages of one length
 _FIRST_LAYOUTS, _HITS_PER_LAYOUT = 64, 8
 """A layout costs about three checks: where shapes do not come again, no more of them are made."""
 _LEAST_AT_ONCE = 8  # messages: of fewer the call of a kernel takes longer than they do one by one
@@ -37,12 +37,12 @@ _VARINTS = {0x08: 0, 0x20: 7, 0x28: 7, 0x30: 9, 0x38: 6}
 """Of an observation: most bytes of each varint, so that its bound holds (2⁵³, 2⁶², an hour); 0: as in the model."""
 _STRINGS = {0x12: _VARIABLE, 0x1A: _VARIABLE}
 """Names of camera and boot, which are looked up once parsed."""
-_DETECTION = 0x42
+_DETECTION = 0x42  # tag of the observation's field 8
 _DOUBLES = {0x09: (MAX_PIXEL, True), 0x11: (MAX_PIXEL, True), 0x19: (MAX_PIXEL, False), 0x21: (1.0, False)}
 """Of a detection: the bound of u, v, size, score, and whether it may be negative."""
 _TEXTS = {0x2A: _TEXT, 0x42: _LITERAL, 0x62: _TEXT}
 """label, kind, target."""
-_COLOUR, _COVARIANCE = 0x32, 0x3A
+_COLOUR, _COVARIANCE = 0x32, 0x3A  # tags of a detection's fields 6 and 7
 _PACKED = {0x3A: (MAX_PIXEL**2, (1,)), 0x4A: (MAX_PIXEL, (0, 1)), 0x52: (MAX_PIXEL, (0, 1)), 0x5A: (MAX_PIXEL, (0, 1))}
 """covariance, head, foot, box: the bound, and which of the numbers may be negative."""
 

@@ -15,6 +15,7 @@ from typing import Any
 from protocols.core.errors import InputError
 from protocols.core.names import check_identifier, is_name
 from protocols.core.ranges import (
+    MAX_CAMERAS,
     MAX_CLOCK_RATE,
     MAX_COUNT,
     MAX_DISTORTION,
@@ -36,7 +37,6 @@ from protocols.messages import syncline_pb2 as pb
 SCHEMA_VERSION = 1  # of the messages
 
 MAX_DETECTIONS = 4096  # of one frame
-MAX_CAMERAS = 1024  # of a hub
 MAX_OVERLAPS = 12 * MAX_CAMERAS  # of each camera as many as a calibration takes pairs
 MAX_NUMBERS = 256  # of one list
 MAX_LABEL = 64  # characters
@@ -165,13 +165,13 @@ def _stds(values: Sequence[float], name: str, lengths: tuple[int, ...], most: fl
         raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is below {MIN_STD:g}, but not 0")
 
 
-def _covariance_2d(covariance: Sequence[float], name: str) -> None:
-    _vector(covariance, name, (0, 3), -(MAX_PIXEL**2), MAX_PIXEL**2)
+def _covariance_2d(covariance: Sequence[float]) -> None:
+    _vector(covariance, "covariance", (0, 3), -(MAX_PIXEL**2), MAX_PIXEL**2)
     if covariance:
         uu, uv, vv = covariance
         # The tolerance lets a rank-one covariance pass after rounding.
         if uu < 0.0 or vv < 0.0 or uv * uv > uu * vv * (1.0 + 1e-9) + 1e-12:
-            raise Rejected(RejectionReason.OUT_OF_RANGE, f"{name} is not a covariance")
+            raise Rejected(RejectionReason.OUT_OF_RANGE, "covariance is not a covariance")
 
 
 def _intrinsics(message: Any) -> None:
@@ -211,7 +211,7 @@ def _detection(detection: pb.Detection) -> None:
     if detection.HasField("colour"):
         _colour(detection.colour)
     if detection.covariance:
-        _covariance_2d(detection.covariance, "covariance")
+        _covariance_2d(detection.covariance)
     if detection.kind:
         _one_of(detection.kind, "kind", _KINDS | {"corner"})
     if detection.head:
@@ -386,7 +386,7 @@ def _predicted_target(target: pb.PredictedTarget) -> None:
         _number(value, name, -MAX_PIXEL, MAX_PIXEL)
     for value, name in ((target.u_velocity, "u_velocity"), (target.v_velocity, "v_velocity")):
         _number(value, name)
-    _covariance_2d(target.covariance, "covariance")
+    _covariance_2d(target.covariance)
     _number(target.size, "size", 0.0, MAX_PIXEL)
     _vector(target.head, "head", (0, 2), -MAX_PIXEL, MAX_PIXEL)
     _vector(target.foot, "foot", (0, 2), -MAX_PIXEL, MAX_PIXEL)

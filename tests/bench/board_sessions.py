@@ -29,12 +29,11 @@ from deploy.cli import run
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import fit_similarity
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 from protocols.session.calibration import read_calibration
 from tests.support.board_session import BoardCamera, BoardWorld, board_world
 from tests.support.videos import write_video_frames
 
-Image = npt.NDArray[np.uint8]
 SECONDS = 14.0
 _PIXELS, _SUB = 40, 2  # of a square of the drawing; samples of a pixel each way
 _BOARDS = (  # kind, squares, square [m], inverted, dictionary, ratio

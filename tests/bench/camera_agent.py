@@ -22,11 +22,12 @@ from edge import scenes
 from edge.agents.camera import CameraAgent
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.marker.ball import MarkerDetector
-from edge.devices.base import DeviceInfo, Frame, Image
+from edge.devices.base import DeviceInfo, Frame
 from edge.devices.simulated.camera import SimulatedDevice
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.geometry.types import Image
 from protocols.topics import OBSERVATION
 from tests.support.clocks import AsFastAsPossible
 

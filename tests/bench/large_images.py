@@ -12,16 +12,15 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.detectors.base import Detection
 from edge.detectors.board.description import parse_board
 from edge.detectors.board.detector import BoardDetector
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector
+from protocols.geometry.types import Image
 from tests.support import boards
 
-Image = npt.NDArray[np.uint8]
 _FRAMES = 16
 _BOARDS = {
     kind: parse_board({"board": kind, "squares": "8x6", "inverted": False, "mirrored": False, "legacy": False})

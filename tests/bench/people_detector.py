@@ -26,7 +26,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge import scenes
 from edge.detectors.base import Detection
@@ -34,10 +33,9 @@ from edge.detectors.people.person import PersonDetector, silhouette_features
 from edge.detectors.plugins import load_detector
 from edge.scenes.people.renderer import PeopleRenderer
 from edge.scenes.people.scene import PeopleScene
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image
 from tests.support.people_boxes import overlap, score_boxes, truth
 
-Image = npt.NDArray[np.uint8]
 _BAR = 0.9
 _NOISE = 4.0
 

@@ -20,8 +20,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.uav.base import Box, Estimate, Image, Tracker, TrackState
-from protocols.geometry.types import Floats
+from edge.uav.base import Box, Estimate, Tracker, TrackState
+from protocols.geometry.types import Floats, Image
 from tests.bench import uav_rivals
 from tests.bench.real_rigs import DEFAULT_DATA
 

@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 
 from edge.uav import tracker_factory
-from edge.uav.base import Box, Estimate, Image, Tracker, TrackState
+from edge.uav.base import Box, Estimate, Tracker, TrackState
 from edge.uav.image_motion.scene_motion import SceneMotion
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 from tests.bench import uav_rivals
 from tests.bench.real_rigs import DEFAULT_DATA
 from tests.bench.uav_sequences import AWAY_S, Sequence, aerial, mirrored, oblique, pan_away, share_inside

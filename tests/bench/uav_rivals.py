@@ -14,7 +14,8 @@ from typing import Any
 
 import cv2
 
-from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Telemetry, TrackState
+from protocols.geometry.types import Image
 from tests.bench.peers import CONTRIB
 
 NAMES = ("csrt", "kcf", "mosse")

@@ -10,8 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.uav.base import Image
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 AWAY_S = (0.5, 1.0, 2.0, 4.0)
 """Lengths of the absences [s]."""

@@ -14,7 +14,7 @@ import numpy as np
 from deploy.offline.track import TrackedFrame
 from deploy.offline.track_overlay import draw
 from edge.uav import tracker_factory
-from edge.uav.base import Image
+from protocols.geometry.types import Image
 from tests.support.oblique.world import ObliqueWorld
 
 SCENES = (("car", "follow", 1, 24), ("bicycle", "orbit", 2, 24), ("boat", "zoom", 4, 24), ("person", "away", 3, 38))

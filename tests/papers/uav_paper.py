@@ -16,14 +16,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.uav.base import Estimate, Image, Tracker, TrackState
+from edge.uav.base import Estimate, Tracker, TrackState
 from edge.uav.baselines import regions
 from edge.uav.baselines.paper_tracker import PaperTracker
 from edge.uav.baselines.plain_tracker import PlainTracker
 from edge.uav.world import scenarios
 from edge.uav.world.flight_world import FlightWorld
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 WINDING, TOWN = "paper-3.3", "paper-4.4"
 NEAR = 20.0

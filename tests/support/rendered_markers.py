@@ -9,9 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erf
 
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Floats, Image
 
 
 def dim_room(seed: int, width: int = 640, height: int = 480, level: float = 90.0) -> Floats:

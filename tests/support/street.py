@@ -9,7 +9,6 @@ from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge import scenes
 from edge.devices.playback.video_reader import VideoReader
@@ -20,11 +19,10 @@ from edge.scenes.people.renderer import PeopleRenderer
 from edge.scenes.people.scene import PeopleScene
 from edge.scenes.people.walking import WalkingPaths
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image
 from tests.support.people_boxes import truth
 from tests.support.videos import write_video
 
-Image = npt.NDArray[np.uint8]
 _SIZES = ((320, 240), (480, 270), (640, 480), (768, 432), (960, 540), (1280, 720))
 _RATES = (12.0, 15.0, 25.0, 30.0, 50.0, 60.0)
 _FACADE = 6.0  # m: distance of the houses behind the place where people walk

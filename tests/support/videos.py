@@ -8,15 +8,13 @@ from pathlib import Path
 
 import av
 import numpy as np
-import numpy.typing as npt
 import tomli_w
 
 from edge import scenes
 from edge.scenes import renderer_for
 from edge.scenes.marker.scene import MarkerScene
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-Image = npt.NDArray[np.uint8]
 TICKS = 90_000
 _BITS, _BLOCK = 10, 16
 

@@ -20,6 +20,7 @@ from protocols.session.calibration import CameraCalibration, read_calibration
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, read_rig
+from protocols.validation.codec import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -97,15 +98,13 @@ def write_observation_log(
     rig: Rig,
     observations: Iterable[pb.Observation],
     clocks: dict[str, CameraCalibration],
-    arrivals: Arrivals | None = None,
 ) -> int:
     """Write observations as a log in the order of their exposures on the reference clock; as `session_to_log`.
 
-    clocks: calibrations of all cameras whose frames are written; those of others are left out. arrivals: of the frames,
-    in place of the exposures.
+    clocks: calibrations of all cameras whose frames are written; those of others are left out.
     """
     known = [message for message in observations if message.camera in clocks]
-    return _write_log(out, infos, rig, _with_log_times(known, arrivals or Arrivals(clocks)))
+    return _write_log(out, infos, rig, _with_log_times(known, Arrivals(clocks)))
 
 
 def _write_log(out: Path, infos: Sequence[pb.CameraInfo], rig: Rig, frames: list[tuple[int, pb.Observation]]) -> int:
@@ -169,7 +168,7 @@ def camera_info(rig: Rig, name: str) -> pb.CameraInfo:
     from protocols.geometry import so3
 
     camera = rig.cameras[name]
-    info = pb.CameraInfo(schema_version=1, camera=name, boot_id="import", driver="import", clock="device")
+    info = pb.CameraInfo(schema_version=SCHEMA_VERSION, camera=name, boot_id="import", driver="import", clock="device")
     info.target = str(rig.metadata.get("target", ""))
     info.width, info.height, info.fps = camera.size[0], camera.size[1], camera.fps
     if camera.intrinsics is not None:
@@ -186,7 +185,7 @@ def camera_info(rig: Rig, name: str) -> pb.CameraInfo:
 
 
 def _rig_info(rig: Rig) -> pb.RigInfo:
-    info = pb.RigInfo(schema_version=1, units=rig.units, clock=rig.clock)
+    info = pb.RigInfo(schema_version=SCHEMA_VERSION, units=rig.units, clock=rig.clock)
     info.reference_camera = str(rig.metadata.get("reference", ""))
     for a, b, length in rig.distances:
         info.distances.add(camera_a=a, camera_b=b, distance=length)
@@ -208,7 +207,12 @@ def _observation_messages(rig: Rig, observations: Observations) -> list[pb.Obser
                 seen.append((track.label, float(u), float(v), float(size) if np.isfinite(size) else 0.0))
         for sequence, ((time_ns, frame), seen) in enumerate(sorted(frames.items())):
             message = pb.Observation(
-                schema_version=1, camera=name, boot_id="import", sequence=sequence, frame=frame, device_time_ns=time_ns
+                schema_version=SCHEMA_VERSION,
+                camera=name,
+                boot_id="import",
+                sequence=sequence,
+                frame=frame,
+                device_time_ns=time_ns,
             )
             for label, u, v, size in seen:
                 message.detections.add(u=u, v=v, size=size, score=1.0, label=label)

@@ -18,7 +18,7 @@ from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.jpeg import decode_jpeg
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 from protocols.log.read.images import image_runs, read_images
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
@@ -27,7 +27,6 @@ from protocols.session.rig import METRES_PER_UNIT
 if TYPE_CHECKING:
     from deploy.offline.follow.calibration import GivenCalibration
     from deploy.offline.follow.source import FollowInput
-    from edge.devices.base import Image
     from hub.tracking.offline import FollowedTrack
 
 Progress = Callable[[str, float], None]

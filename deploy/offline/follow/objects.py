@@ -21,14 +21,15 @@ import numpy as np
 from deploy.offline.csv_table import CsvTable, read_csv_header, read_csv_table
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
+from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.detections import DetectionRows, read_detections
+from protocols.validation.codec import SCHEMA_VERSION
 
 Kind = Literal["person", "vehicle"]
 BOXES_FILE = "boxes.csv"
 _BOX_COLUMNS = ("camera", "frame", "time", "x", "y", "width", "height")
-_MAX_PIXEL = 1e6  # far outside every image
 _MAX_TIME_S = 9e9
 """Beyond it a time [s] does not fit into 64 bits of nanoseconds."""
 _MAX_EMPTY_PER_FRAME = 20
@@ -89,7 +90,7 @@ def _flat(box: Floats, wrong: str, row: int) -> str:
 
 
 def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> DetectionRows:
-    box = np.column_stack([table.numbers(name, _MAX_PIXEL) for name in ("x", "y", "width", "height")])
+    box = np.column_stack([table.numbers(name, MAX_PIXEL) for name in ("x", "y", "width", "height")])
     for side, wrong in ((3, "its foot is not below its head"), (2, "its right side is not right of its left")):
         table.refuse(box[:, side] <= 0.0, partial(_flat, box, wrong))
     limit = np.array([sizes[name] for name in table.columns["camera"]], dtype=np.float64)
@@ -136,11 +137,11 @@ def _check_pairs(rows: DetectionRows, file: Path) -> None:
             raise InputError(what, file=file, line=max(rows.line[head], rows.line[foot]), remedy="swap the labels")
 
 
-def object_messages(rows: DetectionRows, *, fill: bool = True) -> list[pb.Observation]:
+def object_messages(rows: DetectionRows) -> list[pb.Observation]:
     """The rows as observation messages with all that is known of each detection, by camera and time.
 
-    ``sequence`` is the frame number where a camera's frames are numbered, otherwise it counts. fill: also make messages
-    of the frames without a row between two with rows, where frames are numbered: they say that nobody was detected.
+    ``sequence`` is the frame number where a camera's frames are numbered, otherwise it counts. Where they are
+    numbered, frames without a row between two with rows have a message too: nobody was detected.
     """
     out: list[pb.Observation] = []
     names = np.array(rows.camera)
@@ -151,13 +152,13 @@ def object_messages(rows: DetectionRows, *, fill: bool = True) -> list[pb.Observ
         stamps, first, counts = np.unique(time_ns[mine], return_index=True, return_counts=True)
         frames = rows.frame[mine[first]]
         numbered = bool((np.diff(frames) > 0).all()) and frames[0] >= 0
-        empty_stamps, empty_frames = _empty_frames(stamps, frames) if fill and numbered else (stamps[:0], frames[:0])
+        empty_stamps, empty_frames = _empty_frames(stamps, frames) if numbered else (stamps[:0], frames[:0])
         order = np.argsort(np.concatenate([stamps, empty_stamps]), kind="stable").tolist()
         every_stamp = np.concatenate([stamps, empty_stamps]).tolist()
         every_frame = np.concatenate([frames, empty_frames]).tolist()
         for index, at in enumerate(order):
             message = pb.Observation(
-                schema_version=1, camera=name, boot_id="session", device_time_ns=every_stamp[at],
+                schema_version=SCHEMA_VERSION, camera=name, boot_id="session", device_time_ns=every_stamp[at],
                 sequence=every_frame[at] if numbered else index, frame=max(every_frame[at], 0),
             )  # fmt: skip
             if at < len(stamps):

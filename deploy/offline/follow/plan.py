@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from deploy.offline.follow.calibration import GivenCalibration
     from hub.tracking.offline import FollowedTrack
 
-_WIDTH, _MARGIN = 1000.0, 44.0
-_SMALL = 320.0
-_MAX_HEIGHT = 820.0
+_WIDTH, _MARGIN = 1000.0, 44.0  # px of the drawing, and around the plan in it: room for the axes' numbers
+_SMALL = 320.0  # px: width of the plan of one camera's coverage
+_MAX_HEIGHT = 820.0  # px: a long and narrow plan still fits on a screen
 MOST_NUMBERS = 40
 """Paths with a number in the plan; the others show it under the pointer."""
 _SEEN_WITHIN = 0.02

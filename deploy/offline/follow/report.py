@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from deploy.offline.follow.source import FollowInput
     from hub.tracking.offline import FollowedTrack, FollowResult
 
-_WIDTH, _LEFT, _RIGHT = 1000.0, 130.0, 70.0
+_WIDTH, _LEFT, _RIGHT = 1000.0, 130.0, 70.0  # px of the drawing, and of its margins
 _MAX_ROWS = 150
 """Tracks in the timeline and in the table; longer ones first where there are more."""
 _UNFOLDED = 30  # tracks; more are folded away

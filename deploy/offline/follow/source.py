@@ -22,6 +22,7 @@ from hub.tracking.detections import TrackingCamera
 from hub.trajectory.image_tracks import MAX_PAUSE_S
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
+from protocols.core.ranges import MAX_TIME_NS
 from protocols.log.read.reader import LogReader
 from protocols.log.read.session import is_log
 from protocols.messages import syncline_pb2 as pb
@@ -33,7 +34,6 @@ Progress = Callable[[str, float], None]
 LOG_OF_VIDEOS = "detections.mcap"
 _MAX_ROWS = 2_000_000
 """Reference times at which tracks are wanted: 18 h at 30 Hz."""
-_MAX_TIME_NS = 2**62  # half of what 64 bits hold: differences do not overflow
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,7 +174,7 @@ def _wanted_times(
     by_camera: dict[str, set[int]] = {}
     for name, camera in known.calibration.cameras.items():
         clock = camera.time_map
-        if abs(clock.time_offset) * NANOSECONDS > _MAX_TIME_NS or not 0.5 < clock.clock_rate < 2.0:
+        if abs(clock.time_offset) * NANOSECONDS > MAX_TIME_NS or not 0.5 < clock.clock_rate < 2.0:
             what = f"[{name}] time_offset or clock_rate is beyond any clock"
             raise InputError(what, file=known.file, remedy="give seconds, and a rate near 1")
         tracked = TrackingCamera.from_calibration(camera)
@@ -182,7 +182,7 @@ def _wanted_times(
         if times:
             by_camera[name] = times
     every = set().union(*by_camera.values())
-    if max(map(abs, every)) > _MAX_TIME_NS:
+    if max(map(abs, every)) > MAX_TIME_NS:
         raise InputError("its times are beyond 146 years", file=known.file, remedy="check time_offset and the session")
     if fps is not None:
         count = round((max(every) - min(every)) * fps / NANOSECONDS) + 1

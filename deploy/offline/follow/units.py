@@ -28,7 +28,7 @@ _FRAMES = 60
 _WITHIN = 0.35
 """Distance, as a share of a person's height, within which the feet that two cameras see are one person's: 0.6 m, which
 somebody walks between two frames 0.4 s apart."""
-_SAME_TIME_NS = 250_000_000
+_SAME_TIME_NS = 250_000_000  # a camera at 2 Hz has a frame as near as this to every chosen moment
 _MIN_SHARE, _CLEARLY = 0.2, 4.0
 """Least share of people whom two cameras see at one place, and how many times the share in the stated units it must be.
 In the crowd of seven cameras the share is 0.42 in metres, and at most 0.11, by chance, in any other of these units."""

@@ -18,6 +18,7 @@ from deploy.offline.video_folder import VideoFile, list_videos
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
+from protocols.validation.codec import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     from deploy.offline.follow.calibration import GivenCalibration
@@ -149,7 +150,7 @@ def _detect(job: _Job, report: Callable[[float], None]) -> _Detected:
     frames = (_moving_detections if shipped else _network_detections)(video, job, report)
     messages = [
         pb.Observation(
-            schema_version=1, camera=job.camera, boot_id="video", sequence=frame, frame=frame,
+            schema_version=SCHEMA_VERSION, camera=job.camera, boot_id="video", sequence=frame, frame=frame,
             device_time_ns=round(time * NANOSECONDS), detections=[detection_message(one) for one in found],
         ).SerializeToString()
         for frame, time, found in frames

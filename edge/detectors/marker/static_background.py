@@ -11,9 +11,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from protocols.geometry.types import Bools
+from protocols.geometry.types import Bools, Image
 
-Image = npt.NDArray[np.uint8]
 _STRIPES = 24  # frames until every row has been sampled once: few rows per frame take little time
 _MEAN_COUNT = 8  # samples of which the mean is taken
 _MIN_COUNT = 3  # samples from which a pixel is known

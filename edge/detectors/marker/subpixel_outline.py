@@ -13,12 +13,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.detectors.marker.static_background import is_known
-from protocols.geometry.types import Bools, Floats
-
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Bools, Floats, Image
 
 _RAYS = 48  # across the outline, evenly spaced
 _MIN_SAMPLES = 20  # samples of the ball alone
@@ -149,7 +146,7 @@ def _rim_offsets(
         colour - ball_colour, just_inside * np.maximum(radius, 0.0) * _STEP * _ANGLE[1]
     )
     beyond = (along >= half[:, None]) & (along <= half[:, None] + _OUTER_BAND)
-    background_colour = np.broadcast_to(_band_mean(colour, beyond, 1)[:, None], colour.shape)
+    background_colour = np.broadcast_to(_band_mean(colour, beyond)[:, None], colour.shape)
     if background is not None:
         known_image, known_counts = (one[top:bottom, left:right] for one in background)
         unoccluded = cv2.remap(known_image, x - left, y - top, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -177,7 +174,7 @@ def _background_along_rays(beside: Floats, unoccluded: Floats, known: Bools, bey
     beside: (n, m, 3) each ray's colour beyond the rim, which is kept where the background ``unoccluded`` (n, m, 3) is
     not ``known`` (n, m) all along the ray or differs there: the camera or an object has moved.
     """
-    change = beside[:, :1] - _band_mean(unoccluded, beyond, 1)[:, None]
+    change = beside[:, :1] - _band_mean(unoccluded, beyond)[:, None]
     holds = known.all(axis=1) & (np.abs(change).max(axis=(1, 2)) < _BACKGROUND_CHANGE)
     return np.where(holds[:, None, None], unoccluded + change, beside)
 
@@ -249,12 +246,12 @@ def _shading_correction(off: Floats, area: Floats) -> Floats:
     return np.asarray((_around(np.einsum("nmk,nm->nk", off, area), 1) / (count + _INNER_RIDGE))[:, None])
 
 
-def _band_mean(colour: Floats, band: Bools, rays: int) -> Floats:
-    """Mean colour (n, 3) over a band (n, m) of each ray's samples (n, m, 3) and of ``rays`` rays to either side."""
+def _band_mean(colour: Floats, band: Bools) -> Floats:
+    """Mean colour (n, 3) over a band (n, m) of each ray's samples (n, m, 3) and of its neighbours'."""
     share = band.astype(np.float64)
     total = np.einsum("nmk,nm->nk", colour, share)
     count = share.sum(axis=1)
-    total, count = _around(total, rays), _around(count[:, None], rays)
+    total, count = _around(total, 1), _around(count[:, None], 1)
     return np.asarray(total / np.maximum(count, 1e-9))
 
 

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Image
+
 Motion = npt.NDArray[np.float32]
 
 _MAX_IMAGES = 32  # that are kept for the first background: bounds the memory

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-Image = npt.NDArray[np.uint8]
 _SPREAD_CELLS, _MIN_SPREAD = 4, 0.4
 """Cells per side of the image, and share of the cells in which corners must agree to show the camera's motion."""
 _CORNERS, _MIN_CORNERS = 400, 12  # tracked at most, at least

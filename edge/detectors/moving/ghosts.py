@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Image
+
 Box = tuple[float, float, float, float]
 
 GHOST_STEP = 22  # 8-bit steps

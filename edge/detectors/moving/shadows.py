@@ -8,10 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image, Singles
 
-Image = npt.NDArray[np.uint8]
-_FloatImage = npt.NDArray[np.float32]
 _ATTENUATION = (0.42, 0.95)  # range of the share of light in a shadow
 _TEXTURE_STEP = 7.0  # 8-bit steps of texture difference that are noise
 _COLOUR_STEP = 9.0  # 8-bit steps by which a shadow changes colours
@@ -92,7 +90,7 @@ class ShadowDetector:
 
 
 def _texture_test(
-    now: _FloatImage, then: _FloatImage, attenuation: _FloatImage, candidate: Image, quiet: Bools
+    now: Singles, then: Singles, attenuation: Singles, candidate: Image, quiet: Bools
 ) -> tuple[Image, Image]:
     """Where a shadow candidate certainly lacks the background's texture, and where it certainly shows it, (h, w) 0/255.
 
@@ -103,9 +101,9 @@ def _texture_test(
     shadow's soft rim, which has gradients of its own. In compressed video a shadow shows less: _MIN_TEXTURE_SHARE. It
     must show significantly less than that, relative to the noise.
     """
-    inside: _FloatImage = (candidate > 0).astype(np.float32)
+    inside: Singles = (candidate > 0).astype(np.float32)
 
-    def total(values: npt.NDArray[Any], size: int) -> _FloatImage:
+    def total(values: npt.NDArray[Any], size: int) -> Singles:
         return np.asarray(cv2.boxFilter(values, cv2.CV_32F, (size, size), normalize=False), dtype=np.float32)
 
     near = np.maximum(total(inside, _NEAR), np.float32(1.0))

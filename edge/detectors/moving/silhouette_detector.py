@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from edge.detectors.moving.foreground import BackgroundSubtractor, SubtractorName
-from edge.detectors.moving.ghosts import Image
 from edge.detectors.moving.tracklets import ShortTermTracker
+from protocols.geometry.types import Image
 
 
 class SilhouetteDetector:

@@ -21,9 +21,8 @@ from edge.detectors.moving.camera_motion import ImageMotion
 from edge.detectors.moving.foreground import BackgroundSubtractor, SubtractorName
 from edge.detectors.moving.silhouette_detector import SilhouetteDetector
 from edge.detectors.moving.tracklets import ImageTracklet
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-Image = npt.NDArray[np.uint8]
 Box = tuple[float, float, float, float]
 _MAX_PIXELS = 500_000  # larger images are downscaled to this
 _MIN_AREA_SHARE = 0.00025  # over the image area: smaller silhouettes are ignored

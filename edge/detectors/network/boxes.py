@@ -13,11 +13,11 @@ import numpy.typing as npt
 
 from edge.detectors.base import Detection
 from protocols.core.clocks import NANOSECONDS
+from protocols.geometry.types import Image
 
 if TYPE_CHECKING:
     from edge.detectors.moving.tracklets import ShortTermTracker
 
-Image = npt.NDArray[np.uint8]
 Point = tuple[float, float]
 
 KINDS: dict[str, Literal["person", "vehicle"]] = {

@@ -16,8 +16,7 @@ from edge.detectors.network.decode import Boxes, decode
 from edge.detectors.network.description import NetworkDescription, read_description
 from edge.detectors.network.runtime import Runtime, open_runtime
 from protocols.core.clocks import NANOSECONDS
-
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Image
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,8 +24,8 @@ roll [rad].
 _PRIOR_STD = np.array([0.3, 0.3, 0.5, 0.06])
 _TILTS, _FOCALS, _RATIOS = np.linspace(-0.15, 1.2, 28), np.log([0.5, 0.65, 0.85, 1.1, 1.5]), np.linspace(-3.2, 0.2, 69)
 _SPREAD = 0.08  # log std of people's heights and of their measurement
-_TALL_WEIGHT = 0.3
-_STEP = 0.02
+_TALL_WEIGHT = 0.3  # of a silhouette that is taller than expected, against a shorter one
+_STEP = 0.02  # of the histogram of log ratios: a quarter of _SPREAD, so that bins do not widen it
 _FINE = np.arange(_RATIOS[0] - 5.0 * _SPREAD, _RATIOS[-1] + 5.0 * _SPREAD, _STEP)
 _ERROR = (_FINE[:, None] - _RATIOS) / _SPREAD
 _SUPPORT = np.exp(-0.5 * np.square(np.where(_ERROR > 0, 1.5, 1.0) * _ERROR))

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.moving.association import match_predictions
@@ -26,11 +25,10 @@ from edge.detectors.moving.tracklets import ImageTracklet
 from edge.detectors.people.height_model import HeightModel
 from edge.detectors.people.segmentation import segment_people
 from edge.detectors.people.silhouettes import BULK, IsolatedPeople, PersonSilhouette
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-Image = npt.NDArray[np.uint8]
 _MAX_PIXELS = 700_000  # larger images are downscaled to this
-_GHOST_AFTER_S = 0.5
+_GHOST_AFTER_S = 0.5  # s: age; sooner, people whom the test mistakes go too, and later, ghosts stay longer
 _GHOST_CHECK_HITS = 3  # detections after which a tracklet that has not moved is tested again for being a ghost
 _U_STD, _V_STD = 0.024, 0.105  # std of the representative point over the size, measured on rendered rooms
 _FLOOR_STD = 0.6  # px

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.detectors.people.height_model import HeightModel
 from edge.detectors.people.occupancy import fit_templates
@@ -25,14 +24,13 @@ from edge.detectors.people.silhouettes import (
     segment_by_shape,
 )
 from edge.detectors.people.templates import BACKGROUND_WEIGHT, Box, SilhouetteRegion, Template, template_mask
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image
 
-Image = npt.NDArray[np.uint8]
 _SHADOW_WEIGHT = -0.08  # log-likelihood ratio of body to background at shadow pixels, relative to a silhouette pixel
 _BREADTH = 0.36  # breadth of a person's box over the height
 _MAX_PIXEL_DISTANCE = 0.33  # over the height: largest distance of a pixel from its person's centre
 _MIN_ISOLATED_BREADTH, _MIN_GROUPED_BREADTH = 0.1, 0.17  # over the height: half of the smallest breadth
-_MAX_LEG_TRIM = 0.3
+_MAX_LEG_TRIM = 0.3  # over the height: legs that end higher above the box's lower edge are hidden, not short
 _PATTERN_PX = 5.0  # working px
 
 

@@ -11,9 +11,8 @@ import numpy.typing as npt
 
 from edge.detectors.people.height_model import LEAST_HEIGHT, HeightModel
 from edge.detectors.people.templates import BACKGROUND_WEIGHT, BARS, TEMPLATE_AREA, Box
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image
 
-Image = npt.NDArray[np.uint8]
 WORK_HEIGHT = 64.0  # px: images of taller people are downscaled to this height
 BULK = 0.28
 """Largest area of one person over the square of the height."""

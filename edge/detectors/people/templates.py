@@ -11,13 +11,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.detectors.people.height_model import HeightModel
-from protocols.geometry.types import Bools, Floats, Ints
+from protocols.geometry.types import Bools, Floats, Image, Ints, Singles
 
-Image = npt.NDArray[np.uint8]
-_FloatImage = npt.NDArray[np.float32]
 Box = tuple[float, float, float, float]
 Window = tuple[int, int, int, int]  # left, top, right, bottom
 BARS = ((0.065, 0.0, 0.14), (0.125, 0.14, 0.52), (0.095, 0.52, 1.0))
@@ -95,8 +92,8 @@ class SilhouetteRegion:
 
     def __init__(
         self,
-        weight: _FloatImage,
-        filled: _FloatImage,
+        weight: Singles,
+        filled: Singles,
         origin: tuple[int, int],
         scales: tuple[float, float],
         height_model: HeightModel,
@@ -107,7 +104,7 @@ class SilhouetteRegion:
         self._uncovered = np.ones(weight.shape, np.float32)  # 1 where no template covers
         self._uncovered_weight = weight.copy()
         self._bars: dict[int, list[tuple[slice, slice]]] = {}  # of the templates that cover the region
-        self._clothing_evidence: dict[int, _FloatImage] = {}
+        self._clothing_evidence: dict[int, Singles] = {}
         wide, high = height_model.size
         left, top = origin
         # Beyond the image nothing is known; beyond this region only, it is empty.
@@ -226,13 +223,13 @@ class SilhouetteRegion:
         left, top, right, bottom = (max(edge, 0) for edge in window)
         return self._covered[top:bottom, left:right].tobytes()
 
-    def unexplained(self) -> _FloatImage:
+    def unexplained(self) -> Singles:
         """Positive weight (h, w) that no template covers."""
         return np.asarray(np.maximum(self._uncovered_weight, np.float32(0.0)), dtype=np.float32)
 
 
 def _box_sums(
-    values: _FloatImage, placements: Placements, boxes: slice | int, outside: float, clear: _FloatImage | None = None
+    values: Singles, placements: Placements, boxes: slice | int, outside: float, clear: Singles | None = None
 ) -> Floats:
     """Sums of values (h, w) over boxes of templates: (boxes, n).
 

@@ -20,13 +20,14 @@ import cv2
 import msgspec
 import numpy as np
 
-from edge.devices.base import Device, DeviceInfo, Frame, Image
+from edge.devices.base import Device, DeviceInfo, Frame
 from edge.devices.live.opencv_capture import OpenCvCamera
 from edge.devices.live.reconnecting import Connection, ConnectionLost, ReconnectingCamera
 from edge.devices.settings import UsbSettings
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Image
 
 _MONOTONIC, _CLOCK_MASK = 0x2000, 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_…
 _START_OF_EXPOSURE, _SOURCE_MASK = 0x10000, 0x70000  # V4L2_BUF_FLAG_TSTAMP_SRC_…; else the end of the frame

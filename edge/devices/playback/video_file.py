@@ -8,11 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.devices.base import DeviceInfo, Frame, Image, check_size
+from edge.devices.base import DeviceInfo, Frame, check_size
 from edge.devices.playback.playback_clock import PlaybackClock, wait_until
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Image
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
 FOLDER_FPS = 30.0

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from edge.devices.base import Image
 from edge.devices.playback.video_file import (
     FOLDER_FPS,
     IMAGE_SUFFIXES,
@@ -28,6 +27,7 @@ from edge.devices.playback.video_file import (
 )
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
+from protocols.geometry.types import Image
 
 if TYPE_CHECKING:
     from av import VideoFrame as AvFrame

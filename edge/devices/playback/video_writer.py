@@ -8,9 +8,9 @@ from pathlib import Path
 
 import cv2
 
-from edge.devices.base import Image
 from protocols.core.errors import InputError
 from protocols.core.files import completed_file
+from protocols.geometry.types import Image
 
 
 @contextmanager

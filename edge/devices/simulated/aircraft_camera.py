@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge.devices.base import DeviceInfo, Frame, Image
+from edge.devices.base import DeviceInfo, Frame
 from edge.devices.playback.playback_clock import PlaybackClock, wait_until
 from edge.devices.simulated.aircraft import SimulatedAircraft
 from edge.uav.world.flight_world import FlightWorld
 from protocols.core.clocks import NANOSECONDS
+from protocols.geometry.types import Image
 
 _TRANSFER_S = 0.004  # from mid-exposure to the host
 
@@ -17,7 +18,7 @@ class FlightCamera:
     """Delivers a frame when it is due on the playback clock; overdue frames are skipped and counted in ``late``.
 
     world: the rendered world. aircraft: gives the camera pose. playback_clock: the true time. clock_offset_s: the
-    camera's clock minus the true time [s]. duration_s: duration of the recording; None: that of the world.
+    camera's clock minus the true time [s].
     """
 
     def __init__(
@@ -27,12 +28,10 @@ class FlightCamera:
         playback_clock: PlaybackClock,
         *,
         clock_offset_s: float = 0.0,
-        duration_s: float | None = None,
     ) -> None:
         self._world, self._aircraft, self._playback_clock = world, aircraft, playback_clock
         self._clock_offset_s = clock_offset_s
-        last = world.length if duration_s is None else min(world.length, int(duration_s * world.fps) + 1)
-        self._last = last
+        self._last = world.length
         self._next = 0
         self._open = False
         self.late = 0

@@ -11,7 +11,7 @@ from edge import scenes
 from edge.devices.base import DeviceInfo, Frame
 from edge.devices.playback.playback_clock import PlaybackClock, RealTime, wait_until
 from edge.scenes import renderer_for
-from edge.scenes.common.base import Renderer, SimulatedClock, SimulatedScene
+from edge.scenes.common.base import Renderer, SimulatedScene
 from edge.scenes.common.rescaling import rescale_scene
 from protocols.core.clocks import NANOSECONDS
 
@@ -48,7 +48,7 @@ class SimulatedDevice:
 
     scene, camera: the scene and the name of one of its cameras. seed: of jitter, drops and noise.
     playback_clock: the true time; processes of one scene must share it. Frames start when the device is opened.
-    duration_s: duration of the recording; None = endless. clock: replaces the scene's camera clock, as after a reboot.
+    duration_s: duration of the recording; None = endless.
 
     Where rendering is slower than the frame rate, overdue frames are skipped (counted in ``late``) to stay in real
     time. ``dropped`` counts the simulated frame drops.
@@ -62,11 +62,10 @@ class SimulatedDevice:
         playback_clock: PlaybackClock,
         *,
         duration_s: float | None = None,
-        clock: SimulatedClock | None = None,
     ) -> None:
         self._scene = scene
         self._camera = scene.camera(camera)
-        self._clock = self._camera.clock if clock is None else clock
+        self._clock = self._camera.clock
         index = [one.name for one in scene.cameras].index(camera)
         self._capture, self._sensor = np.random.default_rng([seed, index]).spawn(2)
         self._playback_clock = playback_clock

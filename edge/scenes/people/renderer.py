@@ -18,12 +18,11 @@ from edge.scenes.common.base import Renderer
 from edge.scenes.common.sensor import PEDESTAL, SensorNoise, pixel_rays, subtract_pedestal
 from edge.scenes.people.scene import RADII, Person, joint_radii
 from edge.scenes.people.walking import JOINTS
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 if TYPE_CHECKING:
     from edge.scenes.people.scene import PeopleScene
 
-Image = npt.NDArray[np.uint8]
 _BACKGROUND_STREAM = 2  # of the random numbers, apart from those of people and noise
 _NOISE_STD = 3.0  # 8-bit steps, of a small sensor indoors
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
@@ -37,7 +36,7 @@ _LIMBS = ("hip", "knee", "ankle", "toe"), ("shoulder", "elbow", "hand")
 class PeopleRenderer(Renderer):
     """Images of a people scene from one camera.
 
-    noise_rng: sensor noise. noise_std: its std [8-bit steps]. shadows: whether people cast shadows. background: (H, W,
+    noise_rng: sensor noise. noise_std: its std [8-bit steps]. background: (H, W,
     3) BGR in place of the scene's room.
     """
 
@@ -47,13 +46,11 @@ class PeopleRenderer(Renderer):
         camera: str,
         noise_rng: np.random.Generator,
         noise_std: float = _NOISE_STD,
-        shadows: bool = True,
         background: Image | None = None,
     ) -> None:
         self._scene = scene
         self._name = camera
         self._camera = scene.camera(camera)
-        self._shadows = shadows
         lens = self._camera.intrinsics
         if background is None:
             u, v = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
@@ -81,7 +78,7 @@ class PeopleRenderer(Renderer):
         joints = self._scene.joints(np.array([true_time]))[0]
         pixels = self._scene.seen_by(self._name, joints)
         depth = self._camera.pose.camera_from_world(joints.reshape(-1, 3))[:, 2].reshape(joints.shape[:2])
-        image = self._shaded(joints) if self._shadows else self._dimmed.copy()
+        image = self._shaded(joints)
         for index in np.argsort(-depth[:, _J["pelvis"]]):
             if np.isfinite(pixels[index]).all():
                 scale = self._camera.intrinsics.focal / depth[index]

@@ -14,20 +14,20 @@ from protocols.geometry.types import Bools, Floats
 
 Grey = npt.NDArray[np.uint8]
 
-_PARTICLES = 500
+_PARTICLES = 500  # of three dimensions: more cost CPU, fewer make their mean noisy
 _INITIAL_STD = np.array([8.0, 8.0, 0.02])  # std of the initial motion: px, px, rad
 _PROCESS_NOISE_STD = np.array([2.5, 2.5, 0.008])  # std per frame: px, px, rad
 _SMALL_STEP_SCALE = 0.08  # factor on the noise of a share of the particles, for precision in a steady flight
-_SMALL_STEP_SHARE = 0.6
+_SMALL_STEP_SHARE = 0.6  # the others follow manoeuvres
 _SHARPNESS = 12.0  # lambda of the likelihood [1/px]
 _MAX_RESIDUAL = 3.0  # px: flow residuals are capped here; larger ones belong to moving objects
-_MAX_CORNERS = 90
+_MAX_CORNERS = 90  # each adds a residual to every particle's likelihood: CPU
 _MIN_FLOWS = 6  # smallest number of flow vectors for an update; with fewer, prediction only
-_MIN_CORNERS = 60
+_MIN_CORNERS = 60  # with fewer they are detected anew: those that leave the image leave one side of it empty
 _BORDER = 24  # px: corners nearer to the border than this are not used
 _CORNER_SPACING = 14  # px between corners
-_WINDOW = (15, 15)
-_LEVELS = 3
+_WINDOW = (15, 15)  # px: a smaller one fails where there is little texture, a larger one mixes motions
+_LEVELS = 3  # halvings of the image: half a window of the smallest one is 56 px
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.base import Box, Image
+from edge.uav.base import Box
 from edge.uav.baselines import histograms
 from edge.uav.baselines.background import BackgroundMotion
 from edge.uav.baselines.regions import ExistenceMap
@@ -17,7 +17,7 @@ from edge.uav.baselines.road import (
     road_heading,
     road_log_likelihood,
 )
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _TURN_NOISE = 0.06  # rad a frame
 _ROAD_TURN_NOISE = 0.10  # rad: std of theta' about the road heading

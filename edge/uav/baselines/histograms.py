@@ -8,15 +8,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Box, Image
-from protocols.geometry.types import Bools, Floats
+from edge.uav.base import Box
+from protocols.geometry.types import Bools, Floats, Image
 
 Bins = npt.NDArray[np.uint8]
 
-HUES, SATURATIONS = 12, 4
+HUES, SATURATIONS = 12, 4  # bins: more tell similar colours apart, fewer bear other light
 BINS = 1 + HUES * SATURATIONS
-SHARPNESS = 20.0
-"""lambda of eq. (2.8); the paper gives no value."""
+_SHARPNESS = 20.0  # lambda of eq. (2.8); the paper gives no value
 _BITS = 5  # of each channel in the look-up table
 _GREY_SATURATION = 40  # of 255: below it the hue is unreliable; such pixels share one bin
 _DARK = 40  # of 255: the same for the value
@@ -85,9 +84,9 @@ def bhattacharyya(template: Floats, histograms: Floats) -> Floats:
     return np.asarray(np.sqrt(histograms) @ np.sqrt(template), dtype=np.float64)
 
 
-def colour_log_likelihood(similarity: Floats, sharpness: float = SHARPNESS) -> Floats:
+def colour_log_likelihood(similarity: Floats) -> Floats:
     """Eq. (2.8): the logarithm of exp(-lambda (1 - L)), of similarities (n,)."""
-    return np.asarray(-sharpness * (1.0 - similarity), dtype=np.float64)
+    return np.asarray(-_SHARPNESS * (1.0 - similarity), dtype=np.float64)
 
 
 def visible_similarity(image: Image, centres: Floats, box: Box, template: Floats) -> Floats:

@@ -13,26 +13,25 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Box, Estimate, Hypothesis, Image, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Hypothesis, Telemetry, TrackState
 from edge.uav.baselines import histograms, regions
 from edge.uav.baselines.background import BackgroundFilter, BackgroundMotion
 from edge.uav.baselines.car_models import BackgroundAwareModel, FrameObservation, RoadSteeredModel
-from edge.uav.baselines.plain_tracker import AppearanceTest
+from edge.uav.baselines.plain_tracker import MIN_VISIBLE_SHARE, AppearanceTest
 from edge.uav.baselines.road import RoadCourse, RoadMidline, extrapolated_course
 from edge.uav.baselines.road_filter import RoadFilter, line_support
 from edge.uav.baselines.white_lines import EdgeDistance, find_sections
 from edge.uav.prediction import particle_filter as pf
 from edge.uav.target.box import check_target_box, has_frame_format, visible_share
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _MAX_INITIAL_SPEED = 0.3  # of the box's longer side, per frame
 _SPEED_NOISE = 0.004  # of the box's longer side, a frame
-_FIRST_PARTICLES = 600
-_MIN_PARTICLES, _MAX_PARTICLES = 300, 800
+_FIRST_PARTICLES = 600  # of the first frame, in which speed and heading are unknown
+_MIN_PARTICLES, _MAX_PARTICLES = 300, 800  # of the KLD sample size: fewer lose another road, more cost CPU
 _EXTRAPOLATION = 0.8  # image diagonals: length of the road extrapolation
 _COURSE_STEP = 6.0  # px
-_MIN_VISIBLE_SHARE = 0.5  # of the box that must lie in the image to be called visible
 _LOST_SPREAD = 0.35  # image diagonals: with a larger std of the particles the target is lost
 _DIRECTION_UPDATE_RATE = 0.15  # per frame
 _MIN_MARKED_SHARE = 0.6  # share of the visible road with white lines; below it the target may be on another road
@@ -58,8 +57,7 @@ class FrameDiagnostics:
 class PaperTracker:
     """Tracks by colour, road and regions. Lens, mounting and telemetry are accepted but ignored, as in the paper.
 
-    size: (width, height) [px]. section: 4 for the paper's final model, 3 for the one of section 3.2. teach: statistics
-    of road and other; by default they are learnt from the first frame.
+    size: (width, height) [px]. section: 4 for the paper's final model, 3 for the one of section 3.2.
     """
 
     def __init__(
@@ -71,11 +69,10 @@ class PaperTracker:
         seed: int = 0,
         *,
         section: Literal[3, 4] = 4,
-        teach: regions.RegionStatistics | None = None,
     ) -> None:
         del lens, body_from_camera
         self.size, self.fps = size, fps
-        self._section, self._teach = section, teach
+        self._section = section
         self._rng = np.random.default_rng(seed)
         self._centre = (np.array(size, dtype=np.float64) - 1.0) / 2.0
         self._diagonal = float(np.hypot(*size))
@@ -96,7 +93,7 @@ class PaperTracker:
         road, marked = _first_road(grey, target, road_filter)
         road_course = self._road_course(road)
         small = regions.reduced(image)
-        statistics = self._teach or regions.learn_statistics(small, _first_road_pixels(small, target, road_course))
+        statistics = regions.learn_statistics(small, _first_road_pixels(small, target, road_course))
         self._track = track = _Track(target, image, background, road_filter, road, statistics)
         track.marked = marked
         track.diagnostics = _diagnose(small, statistics, road_course, BackgroundMotion(), 0)
@@ -184,7 +181,7 @@ class PaperTracker:
         track.visible = False
         if (
             observation.image is not None
-            and visible_share(position[0], position[1], track.box, self.size) >= _MIN_VISIBLE_SHARE
+            and visible_share(position[0], position[1], track.box, self.size) >= MIN_VISIBLE_SHARE
         ):
             similarity = histograms.visible_similarity(observation.image, position[None], track.box, track.template)[0]
             track.visible = track.appearance_test.accepts(float(similarity))

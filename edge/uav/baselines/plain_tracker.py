@@ -10,18 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.base import Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Telemetry, TrackState
 from edge.uav.baselines import histograms
 from edge.uav.prediction import particle_filter as pf
 from edge.uav.target.box import check_target_box, has_frame_format, visible_share
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _MAX_INITIAL_SPEED = 0.25  # of the box's longer side, per frame
 _SPEED_NOISE = 0.03  # of the box's longer side, a frame
 _TURN_NOISE = 0.2  # rad a frame
-_PARTICLES = 400
-_MIN_VISIBLE_SHARE = 0.5  # of the box that must lie in the image to be called visible
+_PARTICLES = 400  # more cost CPU, fewer lose a target that turns
+MIN_VISIBLE_SHARE = 0.5  # of the box that must lie in the image to be called visible
 _LOST_AFTER_S = 2.0  # s without a visible target until the state is lost
 _BACKGROUND_QUANTILE = 0.8  # quantile of the similarities around the target, taken for the background
 _UPDATE_RATE = 0.05  # exponential update of the typical similarity, per frame
@@ -139,7 +139,7 @@ class PlainTracker:
     def _state(self, image: Image | None, track: _Track) -> TrackState:
         position = pf.weighted_mean(track.particles.states, track.particles.weights)[:2]
         accepted = False
-        if image is not None and visible_share(position[0], position[1], track.box, self.size) >= _MIN_VISIBLE_SHARE:
+        if image is not None and visible_share(position[0], position[1], track.box, self.size) >= MIN_VISIBLE_SHARE:
             similarity = histograms.visible_similarity(image, position[None], track.box, track.template)[0]
             accepted = track.appearance_test.accepts(float(similarity))
         track.unseen = 0 if accepted else track.unseen + 1

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Box, Image
+from edge.uav.base import Box
 from edge.uav.baselines.road import RoadCourse
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image
 
 Labels = npt.NDArray[np.uint8]
 

@@ -15,6 +15,7 @@ from edge.uav.baselines.background import BackgroundMotion
 from protocols.geometry.types import Floats
 
 _POINTS_PER_SEGMENT = 16  # stored midline points per spline segment
+_MAX_BEND = 1.2  # rad: turn of an extrapolated cubic, which diverges
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,18 +80,18 @@ def spline(points: Floats) -> tuple[BSpline, float]:
     )
 
 
-def extrapolated_course(road: RoadMidline, beyond: float, step: float, bend: float = 1.2) -> RoadCourse:
+def extrapolated_course(road: RoadMidline, beyond: float, step: float) -> RoadCourse:
     """The road and its cubic extrapolation by up to ``beyond`` [px] at both ends, sampled every ``step`` [px].
 
-    A cubic diverges: where it has turned by more than ``bend`` [rad] from the road's end, the course goes straight on.
+    A cubic diverges: where it has turned by more than ``_MAX_BEND`` from the road's end, the course goes straight on.
     """
     curve, length = spline(road.points)
     inside = np.linspace(0.0, length, max(int(length / step), 2) + 1)
     middle = np.asarray(curve(inside))
     slopes = np.asarray(curve(inside, 1))
     headings = np.arctan2(slopes[:, 1], slopes[:, 0])
-    after, after_heading = _extrapolated(curve, length, beyond, step, bend)
-    before, before_heading = _extrapolated(curve, 0.0, -beyond, step, bend)
+    after, after_heading = _extrapolated(curve, length, beyond, step)
+    before, before_heading = _extrapolated(curve, 0.0, -beyond, step)
     return RoadCourse(
         np.vstack([before[::-1], middle, after]),
         np.concatenate([before_heading[::-1], headings, after_heading]),
@@ -99,13 +100,13 @@ def extrapolated_course(road: RoadMidline, beyond: float, step: float, bend: flo
     )
 
 
-def _extrapolated(curve: BSpline, start: float, beyond: float, step: float, bend: float) -> tuple[Floats, Floats]:
+def _extrapolated(curve: BSpline, start: float, beyond: float, step: float) -> tuple[Floats, Floats]:
     """Points (m, 2), a step apart, and headings (m,) along the increasing parameter, from start outwards."""
     forward = np.sign(beyond)
     parameter = start + forward * np.linspace(0.0, abs(beyond), int(abs(beyond) / step) + 1)
     slopes = np.asarray(curve(parameter, 1))
     turned = np.unwrap(np.arctan2(slopes[:, 1], slopes[:, 0]))
-    past = np.abs(turned - turned[0]) > bend
+    past = np.abs(turned - turned[0]) > _MAX_BEND
     last = int(past.argmax()) - 1 if past.any() else len(turned) - 1
     turned[last + 1 :] = turned[last]
     # Equal steps along the heading: beyond its ends the spline's parameter is not the arc length.

@@ -17,7 +17,7 @@ from edge.uav.baselines.white_lines import DISTANCE_CAP, EdgeDistance, RoadSecti
 from edge.uav.prediction import particle_filter as pf
 from protocols.geometry.types import Floats
 
-_PARTICLES = 120
+_PARTICLES = 120  # at either end of the road: two dimensions, and a stride moves them little
 _SHARPNESS = 0.35  # lambda of (3.7) [1/px^2]
 _OFFSET_STD = 1.5  # px: std of the position that the spline gives
 _FIT_STRIDES = 4  # strides of known road that the arc is fitted to before it extends beyond the end

@@ -23,9 +23,9 @@ _SEARCH_RADIUS = 2.0  # search distance from the target, in its longer side
 _TARGET_RADIUS = 0.15  # radius of the target itself, in the same unit
 _HALF_WIDTHS = (0.35, 1.4)  # of a lane or a road, in the same unit
 _ALONG = (1.5, 4.0)  # averaging length along the road, to each side, same unit; the second bridges a crossing
-_CANDIDATES = 5
-_SAMPLES = 41
-_ANGLES = 72
+_CANDIDATES = 5  # cross-sections of each kind of line: each more costs a fit of the road
+_SAMPLES = 41  # along a line: 0.075 and 0.2 of the target's longer side apart
+_ANGLES = 72  # over half a turn: 2.5 degrees apart
 _MIN_STRENGTH = 8.0  # grey levels, averaged along the road
 
 

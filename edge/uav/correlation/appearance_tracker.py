@@ -12,14 +12,14 @@ from copy import copy
 
 import numpy as np
 
-from edge.uav.base import Box, Estimate, Image, TrackState
+from edge.uav.base import LOST_AFTER_S, LOST_STD, Box, Estimate, TrackState
 from edge.uav.correlation.belief import Belief
 from edge.uav.correlation.candidate import Kinematics
 from edge.uav.correlation.colour import ColourModel
 from edge.uav.correlation.filter import CorrelationFilter, Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
-from edge.uav.correlation.redetection import Prediction, Redetection
+from edge.uav.correlation.redetection import TRIAL_SIZES, Prediction, Redetection
 from edge.uav.correlation.scale import BoxFlow, ScaleFilter
 from edge.uav.correlation.search import search, tile
 from edge.uav.correlation.shape import Outline
@@ -29,7 +29,7 @@ from edge.uav.image_motion.median_background import MedianBackground
 from edge.uav.image_motion.residual import MovingParts
 from edge.uav.image_motion.scene_motion import STILL, Motion, SceneMotion
 from edge.uav.target.box import check_target_box
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _LEARN_INSIDE = 0.97  # share of the box in the image above which appearance and velocity are learnt
 _SIZE_INSIDE = 0.85  # and above which the flow in it measures its size
@@ -49,13 +49,11 @@ _MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
 _UNKNOWN_STEP = 0.1  # std of a step of the scene that could not be measured, over the image's width
 _FAST_PAN_S = 1.0  # in which a step in the image may be the camera's; over plain water or sky it is the target's
 _MOVES = 0.3  # speed over the scene at which a heading is given, in target lengths a second
-_LOST_STD, _LOST_AFTER_S = 8.0, 15.0  # in target lengths; as of the ground tracker
 _MAX_GROWTH = 8.0  # of a side since the first frame
 _SCALE_GAIN = 0.5  # of the scale filter's correction, per frame
 _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or angle must gain
 _ANCHOR_STEP = 0.3  # share of the way to it
 _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
-_TRIAL_SIZES = (0.9, 1.1)
 _SURE_STD = 0.5  # of where it must be since the evidence was clear, in lengths, to go back to that
 _LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
 
@@ -331,7 +329,7 @@ class AppearanceTracker:
         area = float(np.sqrt(np.prod(box.sides / self._first)))
         shaped = box.sized(self._first * area)
         trials = [box.turned(-box.angle), shaped, shaped.turned(-box.angle)]
-        trials += [box.sized(box.sides * factor) for factor in _TRIAL_SIZES]
+        trials += [box.sized(box.sides * factor) for factor in TRIAL_SIZES]
         now, *gains = self._memory.first_scores(image, [box, *trials])
         best = int(np.argmax(gains))
         if gains[best] < now + _ANCHOR_GAIN:
@@ -392,7 +390,7 @@ class AppearanceTracker:
 
     def _estimate(self, time: float) -> Estimate:
         state = TrackState.VISIBLE if self._missed == 0 else TrackState.COASTING
-        if self._missed and (self.std > _LOST_STD * self.length or self._unseen_s > _LOST_AFTER_S):
+        if self._missed and (self.std > LOST_STD * self.length or self._unseen_s > LOST_AFTER_S):
             state = TrackState.LOST
         centre, extent = self._shape.bounds(self.box)
         x, y = (np.nan, np.nan) if state is TrackState.LOST else (float(centre[0]), float(centre[1]))

@@ -8,9 +8,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from edge.uav.base import Image
 from edge.uav.correlation.oriented_box import OrientedBox, crop
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _INNER, _SIDE = 0.5, 8  # of a box's sides, for its corners show background; side of the resampled part [px]
 # Std of the same thing's colour from view to view [8-bit levels of L*, a*, b*]; rendered targets of less than 8 px, of

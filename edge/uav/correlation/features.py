@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Image
 from protocols.geometry import kernels
+from protocols.geometry.types import Image
 
 Features = npt.NDArray[np.float32]
 

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from edge.uav.base import Image
 from edge.uav.correlation.features import CHANNELS, Features, cell_features
 from edge.uav.correlation.memory import CHANGED, RunningNormal
 from edge.uav.correlation.oriented_box import OrientedBox, crop
+from protocols.geometry.types import Image
 
 _CELL = 4  # [px]
 _AREA_PX = 150  # square root of the area of the resampled window [px]

@@ -14,14 +14,13 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from edge.uav.base import Image
 from edge.uav.correlation.features import Features, cell_features
 from edge.uav.correlation.oriented_box import OrientedBox, crop
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-CELLS, CELL_PX = 6, 4
+CELLS, CELL_PX = 6, 4  # along a side; along a cell: finer cells need a more exact place, coarser ones look alike
 SIDE = CELLS * CELL_PX
-_MAX_TEMPLATES = 8
+_MAX_TEMPLATES = 8  # the first view and the last used: each costs a product at every place that is scored
 _NEW_BELOW = 0.9  # similarity to the most similar template below which a view becomes a template
 _TAIL_BINS = 20  # of the histogram of what places beside the target score, from 0 to 1
 _LOOK_ALIKES = 0.5  # places as similar as the target that are taken to have been seen before the first image

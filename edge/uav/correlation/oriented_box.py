@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from scipy.special import ndtr
 
-from edge.uav.base import Box, Image
-from protocols.geometry.types import Floats
+from edge.uav.base import Box
+from protocols.geometry.types import Floats, Image
 
 _MAX_SHRINK = 2.0  # by linear interpolation alone; beyond, pixels are averaged first, against aliasing
 

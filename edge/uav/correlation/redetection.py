@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.base import Image
 from edge.uav.correlation.candidate import KEEPS, MAX_TESTS, Candidate, Kinematics
 from edge.uav.correlation.colour import ColourModel
 from edge.uav.correlation.filter import Response
@@ -16,7 +15,7 @@ from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.correlation.search import Found, search, tile
 from edge.uav.image_motion.residual import UNKNOWN, Residual
 from edge.uav.image_motion.scene_motion import Motion
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _MARGIN = 1.0  # log odds by which a place must exceed the next best one, and the one under test
 _MANOEUVRE = 3.0  # acceleration of what brakes, turns or sets off, in lengths a second squared; a car that starts
@@ -31,10 +30,10 @@ _DETECTION = 0.25  # probability that one search finds a target in view
 _HIDDEN = 0.1  # probability that it is in view, but behind something, for as long as it is away
 _CHANGE = 0.1  # std of the similarity of a target that has been away
 _MIN_INSIDE = 0.6  # share of a place in the image
-_TRIAL_SIZES = (0.9, 1.1)
+TRIAL_SIZES = (0.9, 1.1)  # factors on the sides: they move the box's border by a third of a template's cell
 _FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
 _TRIAL_TURNS, _FIRST_TURNS = (-0.1, 0.1), (-0.36, -0.18, 0.18, 0.36)  # [rad]
-_SIZES = (1.0, 0.87, 1.15, 0.75, 1.33)
+_SIZES = (1.0, 0.87, 1.15, 0.75, 1.33)  # factors on the sides, one a search: a target comes back nearer or farther away
 _UPRIGHT = float("nan")  # as in the first image, however it had turned: most targets only seem to turn
 _ANGLES = (0.0, _UPRIGHT, 0.35, 0.0, -0.35, _UPRIGHT, 0.7, 0.0, -0.7, _UPRIGHT, 1.1, 0.0, -1.1, _UPRIGHT, 1.57)
 
@@ -158,7 +157,7 @@ class Redetection:
     def _test(self, image: Image, candidate: Candidate, expected: Prediction, dt: float) -> bool:
         """Add a frame's evidence to a place; whether it may still be the target."""
         box, answer = self._localise(image, candidate.box)
-        sizes, turns = (_TRIAL_SIZES, _TRIAL_TURNS) if candidate.hits else (_FIRST_SIZES, _FIRST_TURNS)
+        sizes, turns = (TRIAL_SIZES, _TRIAL_TURNS) if candidate.hits else (_FIRST_SIZES, _FIRST_TURNS)
         if candidate.hits == 0:
             # Before another size or angle is believed: the last one, localised about the same place.
             same, same_answer = self._localise(image, expected.box.at(candidate.box.centre))

@@ -10,26 +10,25 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Image
 from edge.uav.correlation.features import cell_features
 from edge.uav.correlation.filter import refined
 from edge.uav.correlation.oriented_box import OrientedBox, crop
 from edge.uav.image_motion.scene_motion import middle
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _FLOW_PX = 72  # longer side of the resampled box [px]
 _FLOW_GRID = 7  # points a side
 _FLOW_MARGIN = 1.5  # of the resampled region, over the box
-_MIN_POINTS = 8
+_MIN_POINTS = 8  # of 49: of fewer, two wrong ones change the sides
 _FLOW_PRIOR = 8.0  # points whose weight holds the size where the flow is weak
 _MAX_STEP = 1.12  # change of a side in one frame
 _MAX_TURN = 0.15  # in one frame [rad]
 
-_SCALES = 9
+_SCALES = 9  # the present one in their middle: 0.87 to 1.15 of it, more than a side changes in a frame
 _STEP = 1.035  # between neighbouring scales
 _SIDE = 24  # of the resampled box [px]
-_RATE = 0.03
-_REGULARISATION = 0.05
+_RATE = 0.03  # share of a frame in what is learnt: a second's mean at 30 fps
+_REGULARISATION = 0.05  # over the mean energy: frequencies with less have little weight
 
 
 class BoxFlow:

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.base import Image
 from edge.uav.correlation.features import cell_features
 from edge.uav.correlation.memory import CELL_PX, CELLS, TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox, crop
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _MAX_CELLS = 3000  # of a region's feature map; a larger one is cut down about its centre
 _SEPARATION = 0.6  # between candidates, in box sides

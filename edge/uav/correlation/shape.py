@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Image
 from edge.uav.correlation.oriented_box import OrientedBox, crop
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _SIDE = 32  # of the resampled box [px]
 _MARGIN = 2.0  # of the resampled region, over the box

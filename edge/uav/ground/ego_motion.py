@@ -22,9 +22,9 @@ from protocols.geometry.types import Bools, Floats
 Gray = npt.NDArray[np.uint8]
 
 _WORKING_WIDTH = 430  # approximate width of the image on which Lucas-Kanade runs [px]
-_MAX_TRACKS = 110
-_LK_WINDOW = 13
-_MAX_ITERATIONS = 6
+_MAX_TRACKS = 110  # for six unknowns: more cost CPU, fewer leave too few where buildings hide the ground
+LK_WINDOW = 13  # px of the working image: smaller ones fail on little texture, larger ones mix roofs and ground
+_MAX_ITERATIONS = 6  # Gauss-Newton steps, a bound: three narrow the kernel, and it stops where it has converged
 _CORNER_STD = 0.35  # of a tracked corner [px of the working image]
 _MAX_RESIDUAL = 1.5  # of a corner on the plane [px of the working image]
 _MAX_BAD_FRAMES = 3  # after which a track is dropped
@@ -184,7 +184,7 @@ class EgoMotion:
         begin = np.where(usable[:, None], start, self._pixels).astype(np.float32)
         begin = np.clip(begin, -50.0, [width + 50.0, height + 50.0]).astype(np.float32)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.02)
-        window, flags = (_LK_WINDOW, _LK_WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
+        window, flags = (LK_WINDOW, LK_WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
         old, new = self._pixels[:, None], begin[:, None].copy()
         found, status, _ = cv2.calcOpticalFlowPyrLK(
             self._gray, gray, old, new, None, None, window, levels, criteria, flags, minEigThreshold=2e-4

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.uav.base import Box
 from edge.uav.ground.ego_motion import EgoMotion
@@ -15,9 +14,7 @@ from edge.uav.ground.plane_pose import PlanePose
 from edge.uav.timing.telemetry_track import TelemetryTrack
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Floats, Image
 
 _CONVERGED_STD_S = 0.04  # of the clock offset, for which telemetry is used
 _ATTITUDE_STD = np.deg2rad(1.0)  # of the absolute attitude as a measurement, per frame

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Floats, Image
 
 _MAX_LOG_CHANGE = 0.3  # of the gain, per frame
 _LEAK = 0.99  # of the log gain, per frame
-_GAIN_LIMITS = (0.3, 3.0)
+_GAIN_LIMITS = (0.3, 3.0)  # 1.6 stops: beyond, eight bits no longer hold the colours
 _MIN_POINTS = 12  # for an update
 _TARGET_RATE = 0.8  # share of the target's measured change that is applied
 _MAX_TARGET_CHANGE = 0.25  # of the log gain, per measurement
-_MAX_TARGET_LOG_GAIN = 0.7
-_TARGET_DECAY_S = 1.5
-_NEGLIGIBLE_LOG_GAIN = 0.02
+_MAX_TARGET_LOG_GAIN = 0.7  # half or twice the light
+_TARGET_DECAY_S = 1.5  # time constant: longer ones keep a shadow that it has left, shorter ones forget it behind a tree
+_NEGLIGIBLE_LOG_GAIN = 0.02  # five of 255 levels at most: not worth a new table
 _EXTREMES = (0.02, 0.98)  # quantiles of the levels of the darkest and the lightest places
 _FLAT, _SPAN, _MAX_FACTOR = 96.0, 160.0, 8.0  # distance of these that is too small; that it gets; limit of the factor
 

@@ -7,10 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
-Singles = npt.NDArray[np.float32]
+from protocols.geometry.types import Floats, Image, Singles
 
 CELL = 0.5
 """Size of a cell [ground units]."""
@@ -18,9 +15,9 @@ _MAP_CELLS = 1024  # per side
 _UPDATE_REACH = 70.0  # half side of the area that one frame updates [ground units]
 _MESH_SPACING = 12  # cells between the points that are projected exactly
 _MAX_DISTANCE = 1e7  # of the view centre from the origin [ground units]
-_BITS = 4
+_BITS = 4  # of a channel: 4,096 colours; finer ones stay empty for long, coarser ones mix road and roofs
 _BINS = 1 << _BITS
-_MAX_LOG_ODDS = 4.0
+_MAX_LOG_ODDS = 4.0  # eight frames of _MAX_UPDATE: as many unlearn what was wrong
 _MAX_UPDATE = 0.5  # of the log-odds, per frame
 _PRIOR_ROAD_SHARE = 0.3  # share of the image that is road, as a prior
 

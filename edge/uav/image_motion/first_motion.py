@@ -10,11 +10,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from edge.uav.base import Image
 from edge.uav.correlation.features import Features, cell_features
 from edge.uav.correlation.memory import CELL_PX, CELLS
 from edge.uav.correlation.oriented_box import OrientedBox, crop
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _LOOKS_S, _LAST_S = 0.2, 1.2  # between two looks; the last one: later, the target has turned or is covered
 _FASTEST, _STEPS = 2.5, 41  # of the velocities that are tried, in box sides a second

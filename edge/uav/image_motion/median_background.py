@@ -12,10 +12,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from edge.uav.base import Image
 from edge.uav.correlation.oriented_box import OrientedBox, crop
 from edge.uav.image_motion.residual import SURELY, densities, difference, ratio_to_median, share_moving
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _EVERY_S, _UNTIL_S, _IMAGES = 0.2, 3.2, 6  # between two images, and of the last look; least number of images
 _SIDE_PX, _BOX_PX, _REGION = 12, 9, 5  # of a box side in the resampled region, of 0.8; sides of the region, in sides

@@ -11,14 +11,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from edge.uav.base import Image
 from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.image_motion.scene_motion import Motion
-from protocols.geometry.types import Floats
-
-Singles = npt.NDArray[np.float32]
+from protocols.geometry.types import Floats, Image, Singles
 
 _APART_S = 0.35  # between the images that are compared
 _KEEP_S = 0.08  # between two that are kept

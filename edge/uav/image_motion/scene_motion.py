@@ -14,16 +14,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.uav.base import Image
 from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.ground.ego_motion import LK_WINDOW
 from edge.uav.ground.photometric import PhotometricGain
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image
 
 Gray = npt.NDArray[np.uint8]
 
 _WORKING_WIDTH = 400  # approximate width of the image on which the flow is computed [px]
-_MAX_TRACKS = 120
-_LK_WINDOW, _LK_LEVELS = 13, 3
+_MAX_TRACKS = 120  # for four unknowns: more cost CPU, fewer leave parts of the image to what moves in them
+_LK_LEVELS = 3  # halvings of the image: half a window of the smallest one is 48 px
 _BACKWARD_PX = 0.7  # forward-backward distance of a good track [px of the working image]
 _RANSAC_PX = 1.5  # residual of a track of the static scene [px of the working image]
 _BENT = 0.04  # of the shift by a turn: mean of (x/f)^2 over half an image as wide as its focal length
@@ -145,7 +145,7 @@ class SceneMotion:
     def _flow(self, old: Gray, new: Gray, corners: npt.NDArray[np.float32], start: Floats) -> tuple[Floats, Floats]:
         """Old and new positions (n, 2) of the corners that are tracked forward and back."""
         guess = (corners @ start[:, :2].T + start[:, 2]).astype(np.float32)
-        window, flags = (_LK_WINDOW, _LK_WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
+        window, flags = (LK_WINDOW, LK_WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 12, 0.03)
         moved, ok, _ = cv2.calcOpticalFlowPyrLK(
             old, new, corners, guess.copy(), winSize=window, maxLevel=_LK_LEVELS, criteria=criteria, flags=flags

@@ -14,11 +14,11 @@ import numpy as np
 from edge.uav.target.motion_history import MotionFit
 from protocols.geometry.types import Floats
 
-_SAMPLE_SPACING_S = 0.1
-_WINDOW_S = 10.0
+_SAMPLE_SPACING_S = 0.1  # motion fits of windows that overlap by more say the same
+_WINDOW_S = 10.0  # a bend and the straight before it: longer ones keep speeds that traffic has ended
 _MAX_STRAIGHT_LATERAL = 1.0  # lateral acceleration up to which the road counts as straight [units/s²]
 _MIN_CURVE_LATERAL = 1.6  # and from which it is informative about this driver's limit in bends
-_LATERAL_MEDIAN, _LATERAL_LOG_STD = 3.4, 0.3  # prior of the lateral limit: median [units/s²], std of its logarithm
+LATERAL_MEDIAN, _LATERAL_LOG_STD = 3.4, 0.3  # prior of the lateral limit: median [units/s²], std of its logarithm
 _OBSERVED_LOG_STD = 0.15  # the same for a driver observed in a bend
 _CURRENT_SPEED_WEIGHT = 0.5  # of the current speed; the mean speed on straights has the rest
 _RELATIVE_SPEED_STD = 0.04  # std of the cruise speed, over the speed
@@ -68,7 +68,7 @@ class DriverModel:
         else:
             cruise_speed = speeds * (1.0 + np.abs(_STRAIGHT_SPEED_GAIN * rng.standard_normal(count)))
         observed_limit = float(np.quantile(samples[:, 2], 0.9)) if len(samples) >= 5 else 0.0
-        log_limit = np.log(_LATERAL_MEDIAN) + _LATERAL_LOG_STD * rng.standard_normal(count)
+        log_limit = np.log(LATERAL_MEDIAN) + _LATERAL_LOG_STD * rng.standard_normal(count)
         if observed_limit > _MIN_CURVE_LATERAL:
             observed = np.log(observed_limit) + _OBSERVED_LOG_STD * rng.standard_normal(count)
             log_limit = np.maximum(observed, np.where(rng.random(count) < 0.5, observed, log_limit))

@@ -14,7 +14,7 @@ from edge.uav.target.motion_history import MotionFit
 from protocols.geometry.types import Floats
 
 _RETRACE_EVERY = 8  # frames
-_PARTICLE_COUNT = 400
+_PARTICLE_COUNT = 400  # over all paths: more cost CPU, fewer leave an unlikely turn without any
 _ON_PATH_SHARE = 0.92  # of the particles, where the target drove on the road
 _TURN_PROBABILITY, _BRAKING_TURN_GAIN = 0.36, 0.4  # prior at a junction, and its increase for a braking driver
 _MAX_ACCELERATION_STD = 1.5  # of an acceleration that is used

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from edge.uav.ground.image_plane import apply_homography
-from edge.uav.prediction.driver_model import DriverModel
+from edge.uav.prediction.driver_model import LATERAL_MEDIAN, DriverModel
 from edge.uav.prediction.particle_filter import KldSampleSize, effective_sample_size, systematic_resample
 from edge.uav.prediction.paths import RoadPath
 from edge.uav.target.motion_history import MotionFit
@@ -15,13 +15,12 @@ from protocols.geometry.types import Floats, Ints
 
 NO_PATH = -1
 """Path index of a particle that follows no path."""
-_LATERAL_LIMIT = 3.4  # default of the accepted lateral acceleration in bends [units/s²]
 _LOOKAHEADS = (1.0, 5.0, 10.0, 18.0)  # distances along the path at which a driver considers curvature [units]
 _BRAKING_DECELERATION = 2.5  # before a bend [units/s²]
 _MAX_LATERAL_LIMIT = 6.0  # friction limit of tyres [units/s²]
 _CRUISE_TIME_CONSTANT_S = 2.5  # of the return to the cruise speed
 _MAX_CRUISE_ACCELERATION = 2.0  # of that return [units/s²]
-_MAX_SPEED = 60.0
+_MAX_SPEED = 60.0  # [units/s] 216 km/h where a unit is a metre: faster than cars on roads
 _VELOCITY_STD_LIMITS = (0.7, 3.0)  # of a particle set's velocity [units/s]
 _ACCELERATION_PERSISTENCE = 0.35  # share of the acceleration at the last detection that persists
 _MIN_SIGNIFICANCE = 1.5  # of an acceleration, in stds
@@ -118,7 +117,7 @@ def _off_paths(
     position: Floats, heading: Floats, speed: Floats, acceleration: Floats, curvature: Floats
 ) -> ParticleSet:
     """Particles that follow no path."""
-    zeros, path, limit = 0.0 * speed, np.full(len(speed), NO_PATH), np.full(len(speed), _LATERAL_LIMIT)
+    zeros, path, limit = 0.0 * speed, np.full(len(speed), NO_PATH), np.full(len(speed), LATERAL_MEDIAN)
     weights = np.full(len(speed), 1.0 / len(speed))
     return ParticleSet(position, heading, speed, acceleration, curvature, path, zeros, zeros, speed, limit, weights)
 

@@ -14,16 +14,13 @@ import numpy.typing as npt
 
 from edge.uav.correlation.filter import refined
 from edge.uav.ground.image_plane import ImagePlane, apply_homography
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
-Singles = npt.NDArray[np.float32]
+from protocols.geometry.types import Floats, Image, Singles
 
 _BITS = 5  # per colour channel in the table
 _BINS = 1 << _BITS
 _MAX_LOG_RATIO = 2.5  # of a pixel's colour
 _MAX_TARGET_CELLS = 30.0  # the target's length in patch cells
-_MIN_TARGET_CELLS = 12.0
+_MIN_TARGET_CELLS = 12.0  # the same, at least: cells of 0.4 m still tell a car's windows from its roof
 _MAX_PATCH_CELLS = 200  # per side
 _MIN_SHAPE_RATIO = 0.75  # to the typical shape response: the same car under other illumination
 _MIN_VISIBLE_SHARE = 0.3  # of the footprint inside the image

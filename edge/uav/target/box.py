@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge.uav.base import Box, Image
+from edge.uav.base import Box
 from protocols.core.errors import InputError
+from protocols.geometry.types import Image
 
 _MIN_BOX_PX = 4.0  # side
 _MIN_INSIDE_SHARE = 0.3  # share of the box

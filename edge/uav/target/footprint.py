@@ -8,7 +8,7 @@ from edge.uav.ground.image_plane import ImagePlane, apply_homography
 from protocols.geometry.types import Floats
 
 _ASPECT = 0.45  # width over length of a car, where the box does not determine it
-_MIN_ASPECT, _MAX_ASPECT = 0.25, 0.8
+_MIN_ASPECT, _MAX_ASPECT = 0.25, 0.8  # of vehicles: beyond, the box is inexact, and a car's ratio is taken
 
 
 def pixel_jacobian(plane: ImagePlane, matrix: Floats, position: Floats) -> Floats:

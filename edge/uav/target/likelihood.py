@@ -14,13 +14,12 @@ from protocols.geometry.types import Floats
 
 _LLR_SLOPE, _LLR_CENTRE = 14.0, 0.62  # log-likelihood ratio of target to clutter over the score
 _LLR_CENTRE_REACQUIRE = 0.72  # when re-acquiring: crowns of trees have many slightly similar regions
-_MIN_LLR, _MAX_LLR = -6.0, 5.0
+_MIN_LLR, _MAX_LLR = -6.0, 5.0  # odds of 400 and 150: no single frame decides
 _CLUTTER_DENSITY = 0.01  # of candidates that are not the target [1/unit²]
 _MIN_POSTERIOR = 0.7  # of a candidate that is accepted as the target
 _MIN_POSTERIOR_REACQUIRE = 0.8  # the same when re-acquiring
-_MIN_SCORE = 0.45  # of an accepted candidate; when re-acquiring:
-_MIN_SCORE_REACQUIRE = 0.6
-_MIN_SHAPE_REACQUIRE = 0.45
+_MIN_SCORE = 0.45  # of an accepted candidate
+_MIN_SCORE_REACQUIRE, _MIN_SHAPE_REACQUIRE = 0.6, 0.45  # the same when re-acquiring, and of its shape alone
 _BORDER_PENALTY = 0.4  # subtracted from the score, times the share of the candidate outside the image
 _MAX_PEAK_REACQUIRE = 25.0  # of the likelihood of one frame when re-acquiring: a similar car soon drives elsewhere
 _MAX_BAYES_FACTOR = 100.0  # of one tracklet over all its frames

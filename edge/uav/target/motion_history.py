@@ -10,13 +10,13 @@ import numpy as np
 from edge.uav.ground.image_plane import apply_homography
 from protocols.geometry.types import Floats
 
-_WINDOW_S = 0.9
-_BUFFER = 40
-_RECENCY_S = 0.3
+_WINDOW_S = 0.9  # of detections: a longer one averages more, but drivers change their acceleration within a second
+_BUFFER = 40  # detections: the window at 44 fps
+_RECENCY_S = 0.3  # a detection that is this much older has 1/e of the weight
 _INDEPENDENT_SHARE = 0.4  # of a detection's std is independent from frame to frame; the rest is common to all
 _ACCELERATION_STD = 3.5  # of a car, along each axis [units/s²]
 _RELATIVE_ACCELERATION_STD = 0.3  # the same over the speed, where that is more [1/s]
-_VELOCITY_PRIOR_STD = 15.0
+_VELOCITY_PRIOR_STD = 15.0  # along each axis [units/s]: 54 km/h where a unit is a metre
 _REFERENCE_AGE_S = 0.2  # age of the earlier fit against which outliers are judged
 _MIN_REFERENCE_SAMPLES = 8  # detections for a fit to serve as that reference
 

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.target.appearance import Candidate
 from edge.uav.target.motion_history import MotionFit
 from edge.uav.target.target import Target
 from edge.uav.target.tracklets import Tracklet, Tracklets
-from protocols.geometry.types import Floats
-
-Image = npt.NDArray[np.uint8]
+from protocols.geometry.types import Floats, Image
 
 _MAX_BLOBS = 8  # per frame
 _MIN_COLOUR_RESPONSE = 0.35  # relative to the target's typical one

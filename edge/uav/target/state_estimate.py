@@ -6,15 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from edge.uav.base import Estimate, Hypothesis, TrackState
+from edge.uav.base import LOST_AFTER_S, LOST_STD, Estimate, Hypothesis, TrackState
 from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.prediction import particle_filter as pf
 from edge.uav.prediction.particle_set import ParticleSet
 from edge.uav.target import footprint
 from edge.uav.target.target import Target
 
-_LOST_STD = 8.0  # in target lengths
-_LOST_AFTER_S = 15.0
 _MIN_RADIUS, _MAX_RADIUS = 0.7, 2.0  # of a cluster, in target lengths
 _RADIUS_PER_STD = 0.7  # of a cluster, over the particle set's std
 
@@ -43,7 +41,7 @@ def estimate_target(
     std = float(np.sqrt(0.5 * np.trace(axes @ spread @ axes.T)))
     centre = localiser.target_pixels(position[None])[0]
     state = TrackState.COASTING if missed_frames else TrackState.VISIBLE
-    uninformative = std_m > _LOST_STD * target.length or unseen_s > _LOST_AFTER_S
+    uninformative = std_m > LOST_STD * target.length or unseen_s > LOST_AFTER_S
     if missed_frames and (uninformative or not np.isfinite([*centre, std]).all()):
         state = TrackState.LOST
     corners = localiser.target_pixels(target.outline(position, heading))

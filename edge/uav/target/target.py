@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from edge.uav.base import Box
 from edge.uav.ground.localisation import CameraLocaliser
@@ -14,11 +13,9 @@ from edge.uav.target import footprint
 from edge.uav.target.appearance import AppearanceModel, Candidate, GroundPatch, rectify_patch
 from edge.uav.target.motion_history import MotionFit
 from protocols.core.errors import InputError
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-Image = npt.NDArray[np.uint8]
-
-_LEARNING_RATE = 0.04
+_LEARNING_RATE = 0.04  # of a frame: a mean over 25, in which one wrong patch hardly shows
 _CENTRE_HEIGHT_RATIO = 0.155  # height of a car's centre over its length
 _RELEARN_SHARE = 0.12  # increase of the visible share at which the appearance is learnt again
 _FULL_SHARE = 0.97  # visible share that counts as complete

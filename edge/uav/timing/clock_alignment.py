@@ -10,18 +10,18 @@ from collections import deque
 
 import numpy as np
 
-from edge.uav.base import Image, Telemetry
+from edge.uav.base import Telemetry
 from edge.uav.timing.telemetry_offset import OffsetEstimate, find_offset
 from edge.uav.timing.visual_rotation import VisualRotationEstimator
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-_DELAY_BUFFER = 900
-_SEARCH_HALF_WIDTH_S = 0.7
-_WINDOW_S = 24.0
-_FIRST_SOLVE_S, _SOLVE_EVERY_S = 6.0, 2.0
+_DELAY_BUFFER = 900  # frames: half a minute at 30 fps, of which one arrives with little delay
+_SEARCH_HALF_WIDTH_S = 0.7  # wider than telemetry_track's MAX_OFFSET_S: a maximum at the window's end is refused
+_WINDOW_S = 24.0  # of rotation: oscillators drift by at most 2.4 ms in it (1e-4), less than _GOOD_STD_S
+_FIRST_SOLVE_S, _SOLVE_EVERY_S = 6.0, 2.0  # three times the least overlap; a solution costs a correlation
 _GOOD_STD_S = 0.003  # precise enough to pause the estimation
-_PAUSE_S = 60.0
+_PAUSE_S = 60.0  # in which oscillators drift by at most 6 ms
 _MAX_CHANGE_WHILE_TRACKING_S = 0.015  # a larger change of the offset is not applied while a tracker uses it
 _CONFIRMING_FRAMES = 8  # a quarter of a second at 30 fps
 _CLOCK_STEP_NS = 150_000_000  # a smaller step of the clock cannot be distinguished from delays

@@ -15,16 +15,16 @@ import numpy as np
 from edge.uav.base import Telemetry
 from protocols.geometry.types import Bools, Floats
 
-_STEP_S = 1.0 / 60.0
+_STEP_S = 1.0 / 60.0  # of the grid: half a frame at 30 fps, refined afterwards
 _HIGH_PASS_WINDOW_S = 2.0  # of the weighted moving average that is subtracted
 _MIN_COVERAGE = 0.95  # of that window: the mean of half a window would be biased
-_MAX_FRAME_GAP_S = 0.25
-_MAX_TELEMETRY_GAP_S = 2.5
+MAX_FRAME_GAP_S = 0.25  # of two images: the rotation in between is unknown
+_MAX_TELEMETRY_GAP_S = 2.5  # of two samples, as of interpolation: slow links send attitudes once a second or two
 _SPARSE_SPACING_S = 0.08  # attitude sampled less often is interpolated by a rotation spline
 _MIN_LOG_RATIO = 12.0  # of the maximum to other offsets, and (plus log of their number) to no correlation
 _PEAK_HALF_WIDTH_S = 0.35  # offsets closer to the maximum belong to the same peak
 _MIN_OVERLAP_S = 2.0  # of images and telemetry
-_FINE_STEP_S = 0.002
+_FINE_STEP_S = 0.002  # of the refinement, a tenth of _MAX_STD_S; a parabola does the rest
 _GAP_FACTOR = 2.5  # times the median spacing: a longer one is a gap
 _MAX_SPAN_S = 6 * 3600.0  # of images or telemetry: the grids of six hours take 50 MB, and no battery lasts longer
 _MAX_STD_S = 0.02  # of an accepted offset: at 30 degrees a second it is half a degree
@@ -125,7 +125,7 @@ class _IntegratedAngles:
 
 def _visual_angles(visual: RelativeRotations, start: float) -> _IntegratedAngles:
     spans = visual.ends - visual.starts
-    valid = (spans > 0.0) & (spans < _MAX_FRAME_GAP_S)
+    valid = (spans > 0.0) & (spans < MAX_FRAME_GAP_S)
     starts, ends = visual.starts[valid] - start, visual.ends[valid] - start
     integrated = np.cumsum(visual.vectors[valid], axis=0)
     grid = np.arange(0.0, float(ends[-1]), _STEP_S)

@@ -16,15 +16,15 @@ from protocols.geometry.types import Floats
 
 MAX_OFFSET_S = 0.6
 """Largest offset [s]: half a second, plus some delay of the samples themselves."""
-_STEP_S = 0.02
-_PRIOR_STD_S = 0.3
+_STEP_S = 0.02  # between the offsets that are compared; their weighted mean is finer
+_PRIOR_STD_S = 0.3  # of the offset: half of MAX_OFFSET_S
 _MAX_GAP_S = 2.5  # between two samples for interpolation
 _CONFIRMING_SAMPLES = 3  # one alone is an error, not a clock
 _FORGETTING_FACTOR = 0.995  # of the cost, per sample
 _NOISE_RAD = np.deg2rad(0.4)
 _MIN_SPACING_S = 0.06  # samples closer than this are not independent
-_MEAN_TIME_CONSTANT_S = 1.5
-_BUFFER = 400
+_MEAN_TIME_CONSTANT_S = 1.5  # of the mean difference: the visual attitude drifts more slowly, and turns are shorter
+_BUFFER = 400  # samples: 4 s at 100 Hz, above the longest gap and MAX_OFFSET_S together
 
 
 class TelemetryTrack:

@@ -15,12 +15,12 @@ from protocols.core.clocks import NANOSECONDS
 MAX_DELAY_NS = 5 * NANOSECONDS
 """Longest delay from measurement to arrival: an older attitude or position is of no use."""
 _WINDOW_NS = 20 * NANOSECONDS
-_BUFFER = 512
+_BUFFER = 512  # bounds: the window at 25 Hz
 _MAX_DRIFT = 1e-4  # relative rate of two oscillators
-_STEP_NS = 100_000_000
+_STEP_NS = 100_000_000  # smaller steps of the clock are not told from delays
 _REORDER_NS = NANOSECONDS  # a clock that goes back by more has been restarted, or the message is not from that clock
 _MAX_ROUND_TRIP_NS = NANOSECONDS
-_ONE_WAY_STD_NS = 20_000_000
+_ONE_WAY_STD_NS = 20_000_000  # taken as the half width of a single message's bound: its least delay is unknown
 _CONFIRMATIONS = 3  # agreeing messages in a row that replace the estimate …
 _CONFIRM_NS = 500_000_000  # … over at least this time, in which an autopilot at its default 4 Hz contradicts them
 _AGREE_NS = 500_000_000  # jitter of the delays of messages that agree

@@ -11,17 +11,16 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from edge.uav.base import Image, Telemetry
+from edge.uav.base import Telemetry
 from edge.uav.ground.ego_motion import EgoMotion
 from edge.uav.ground.image_plane import ImagePlane
 from edge.uav.ground.plane_pose import PlanePose
-from edge.uav.timing.telemetry_offset import RelativeRotations
+from edge.uav.timing.telemetry_offset import MAX_FRAME_GAP_S, RelativeRotations
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 _NOMINAL_HEIGHT = 50.0  # the scale is not observable
-_MAX_FRAME_GAP_S = 0.25  # between two images
 _MAX_BLIND_FRAMES = 5  # without a pose, after which tracking is restarted
 
 
@@ -42,7 +41,7 @@ class VisualRotationEstimator:
         """
         usable = image is not None and image.shape[:2] == (self._size[1], self._size[0])
         ego = self._ego
-        if ego is None or not usable or image is None or self._last is None or time - self._last[0] > _MAX_FRAME_GAP_S:
+        if ego is None or not usable or image is None or self._last is None or time - self._last[0] > MAX_FRAME_GAP_S:
             self._ego = self._last = None
             if usable and image is not None:
                 self._restart(image, time, camera_from_ned)

@@ -42,7 +42,7 @@ _LAMPS = [
     np.array([(x, y), (x, y + 0.4), (x - 0.28, y + 0.4), (x - 0.28, y)])
     for x, y in ((2.2, -0.8), (2.2, 0.4), (-1.94, -0.8), (-1.94, 0.4))
 ]
-_LAMP_BGR = ((215, 235, 240), (215, 235, 240), (30, 24, 150), (30, 24, 150))
+_LAMP_BGR = ((215, 235, 240), (215, 235, 240), (30, 24, 150), (30, 24, 150))  # two white, two red ones
 _SHADOW = _chamfered(-LENGTH / 2, LENGTH / 2, WIDTH / 2, 0.2)
 _SHADOW_SHIFT = np.array([-0.55, 0.65])  # north, east [m]: offset of the shadow cast by the sun
 

@@ -14,7 +14,7 @@ from edge.uav.world.roads import Curve, arc_length_over_time
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
-FPS = 30.0
+FPS = 30.0  # of the rendered videos; lengths of scenarios and absences are numbers of frames
 _RELATIVE_SPEED = 18.0  # mean speed of the target relative to the image footprint at an exit [m/s]
 _BRIEF_EXIT_SHORTFALL = 5.0  # by how much the drift may fall short of the image border for a brief exit [m]
 _WOBBLE, _WOBBLE_LENGTH = 0.12, 37.0  # lateral amplitude and wavelength [m] of lane keeping

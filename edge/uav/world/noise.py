@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from protocols.geometry.types import Floats
-
-FloatImage = npt.NDArray[np.float32]
+from protocols.geometry.types import Floats, Singles
 
 
 def value_noise(
     rng: np.random.Generator, rows: int, columns: int, cell: float, octaves: int = 1, gain: float = 0.5
-) -> FloatImage:
+) -> Singles:
     """Value noise (rows, columns), std about 1; ``cell`` is the coarsest cell size [px], halved with each octave."""
     total = np.zeros((rows, columns), np.float32)
     power = 0.0

@@ -11,16 +11,14 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.uav.world.noise import value_noise
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image
 
-Image = npt.NDArray[np.uint8]
 SUN_SHADOW = np.array([-0.62, 0.74])
 """North, east metres of shadow per metre of height."""
 _SPRITE_M = 0.1  # metres per pixel of roofs and canopies
-_ROOFS_BGR = ((72, 92, 148), (88, 88, 92), (70, 80, 104), (168, 172, 174), (120, 104, 88), (60, 66, 84))
+_ROOFS_BGR = ((72, 92, 148), (88, 88, 92), (70, 80, 104), (168, 172, 174), (120, 104, 88), (60, 66, 84))  # tiles, slate
 _SHIFT = 4  # bits of OpenCV's fixed-point coordinates
 
 

@@ -22,10 +22,10 @@ from protocols.geometry.types import Floats
 NAME = "patrol"
 LONGEST_S = 3600.0  # s: an hour
 _SIDES = (90.0, 60.0)  # straights of the block [m]
-_RADIUS = 20.0
-_FIRST_EXIT_S, _EXIT_INTERVAL_S = 6.0, 12.0
+_RADIUS = 20.0  # m of the road's middle in the block's corners
+_FIRST_EXIT_S, _EXIT_INTERVAL_S = 6.0, 12.0  # time to learn the target, and to have it back in view between two exits
 _MARGIN = 62.0  # m of modelled ground around the block
-_CRUISE = (8.0, 11.0)
+_CRUISE = (8.0, 11.0)  # m/s: 29 to 40 km/h, in town
 _COLOURS = ("red", "blue", "yellow", "white", "orange")
 
 

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.uav.world import cars
 from edge.uav.world.noise import value_noise
 from edge.uav.world.town import Town
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-Image = npt.NDArray[np.uint8]
 _BANK_MARGIN = 64  # px by which the noise images exceed the frame: 4096 different crops
 _BLUR_SIGMA = 0.6  # px: blur of the lens
 _CLOUD_CELL = 2.0  # metres per pixel of the cloud shadow map

@@ -15,6 +15,7 @@ from protocols.geometry.types import Floats
 
 STEP = 0.5  # metres between the points of a curve
 _TRANSITION_LENGTH = 6.0  # m over which the curvature ramps up and down at a bend
+_MAX_LATERAL, _MAX_LONGITUDINAL = 3.0, 2.2  # m/s²: of a car in a bend, and along its path
 _CORNER_CUT = 5.0  # m of kerb by which the corners of a crossing are cut
 LANE = 3.5  # m, of a usual road
 ROAD_WIDTH = 2 * LANE
@@ -84,11 +85,10 @@ def curve_from_bends(
     end: float,
     course: float,
     sway: Floats | None = None,
-    sway_length: float = 80.0,
 ) -> Curve:
     """The curve from arc length ``begin`` to ``end`` that passes the origin at 0 with ``course`` [rad].
 
-    sway: amplitudes (k,) [1/m] of sinusoidal curvature of wavelengths ``sway_length`` / 1 … k metres.
+    sway: amplitudes (k,) [1/m] of sinusoidal curvature of wavelengths 80 / 1 … k metres.
     """
     s = np.arange(begin, end + STEP, STEP)
     curvature = np.zeros(len(s))
@@ -98,7 +98,7 @@ def curve_from_bends(
         fall = np.clip((s - bend.start - bend.length) / ease + 0.5, 0.0, 1.0)
         curvature += np.sign(bend.angle) / bend.radius * (rise - fall)
     for order, amplitude in enumerate(() if sway is None else sway, 1):
-        curvature += amplitude * np.sin(2.0 * np.pi * order * s / sway_length + 1.7 * order)
+        curvature += amplitude * np.sin(2.0 * np.pi * order * s / 80.0 + 1.7 * order)
     heading = np.r_[0.0, np.cumsum(0.5 * STEP * (curvature[1:] + curvature[:-1]))]
     middle = 0.5 * (heading[1:] + heading[:-1])
     zero = int(np.argmin(np.abs(s)))
@@ -133,25 +133,18 @@ def crossing_outline(one: Road, other: Road) -> Floats | None:
     return np.asarray(outline[np.argsort(np.arctan2(*(outline - middle).T))])
 
 
-def arc_length_over_time(
-    path: Curve,
-    times: Floats,
-    cruise: float | Floats,
-    max_lateral_acceleration: float = 3.0,
-    max_longitudinal_acceleration: float = 2.2,
-) -> Floats:
+def arc_length_over_time(path: Curve, times: Floats, cruise: float | Floats) -> Floats:
     """Arc length (n,) of a car on ``path`` at ``times`` (n,) [s]; at arc length 0 at time 0.
 
     cruise: speed on a straight [m/s], one or (n,) along the path.
-    max_lateral_acceleration: limit in a bend; max_longitudinal_acceleration: limit along the path [m/s²].
     """
     curvature = np.abs(np.gradient(path.course, STEP))
-    limit = np.minimum(cruise, np.sqrt(max_lateral_acceleration / np.maximum(curvature, 1e-6)))
+    limit = np.minimum(cruise, np.sqrt(_MAX_LATERAL / np.maximum(curvature, 1e-6)))
     squares = limit**2
     for k in range(1, len(squares)):  # forward pass: limit of acceleration
-        squares[k] = min(squares[k], squares[k - 1] + 2.0 * max_longitudinal_acceleration * STEP)
+        squares[k] = min(squares[k], squares[k - 1] + 2.0 * _MAX_LONGITUDINAL * STEP)
     for k in range(len(squares) - 2, -1, -1):  # backward pass: limit of braking
-        squares[k] = min(squares[k], squares[k + 1] + 2.0 * max_longitudinal_acceleration * STEP)
+        squares[k] = min(squares[k], squares[k + 1] + 2.0 * _MAX_LONGITUDINAL * STEP)
     speed = np.sqrt(squares)
     moment = np.r_[0.0, np.cumsum(STEP / (0.5 * (speed[1:] + speed[:-1])))]
     moment -= np.interp(0.0, path.arc, moment)

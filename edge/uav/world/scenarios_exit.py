@@ -30,7 +30,7 @@ from protocols.geometry.types import Floats
 
 _BEGIN_S = 1.7  # when the exit manoeuvre begins
 _TAIL_FRAMES = 75  # after the target has returned
-_YAW_BEGIN_S = 2.4
+_YAW_BEGIN_S = 2.4  # the same of a yaw
 
 
 def straight_road(inputs: ScenarioInputs) -> ScenarioPlan:

@@ -16,6 +16,7 @@ from edge.uav.world.roads import Curve, Road
 from protocols.geometry.types import Floats
 
 _CELL = 1.0  # m: cell size of the distance map
+_PARKED_SHARE = 0.22  # of the parking places
 _PARKING_OFFSET = 4.7  # m from the centre line of the road
 
 
@@ -56,13 +57,12 @@ def build_town(
     scenario_occluders: Sequence[Occluder] = (),
     keep_clear: Sequence[Curve] = (),
     not_colour: str = "",
-    parked_share: float = 0.22,
     sight_lines: Sequence[tuple[Floats, Floats]] = (),
 ) -> Town:
     """Place buildings, trees and parked cars at random, and paint the ground.
 
     scenario_occluders: given by the scenario. keep_clear: off-road paths that nothing may block.
-    not_colour: a colour that no parked car has. parked_share: occupied share of the parking places.
+    not_colour: a colour that no parked car has.
     sight_lines: pairs of a camera (3,) and points of a car (n, 3) NED that no building or tree may occlude.
     """
     place = _Placement(
@@ -72,7 +72,7 @@ def build_town(
     trees = place.trees(houses)
     houses = [house for house in houses if not _blocks_view(house, sight_lines)]
     trees = [tree for tree in trees if not _blocks_view(tree, sight_lines)]
-    parked = place.parked(not_colour, parked_share)
+    parked = place.parked(not_colour)
     yards = [_yard(house) for house in houses if rng.random() < 0.7]
     everything: list[Occluder] = [*houses, *scenario_occluders, *trees]
     ground = paint_ground(rng, area, roads, yards, [occluder.shadow() for occluder in everything])
@@ -119,14 +119,14 @@ class _Placement:
             out.append(occluders.random_canopy(rng, centre, radius, rng.uniform(3.0, 5.5)))
         return sorted(out, key=lambda tree: tree.height)
 
-    def parked(self, not_colour: str, share: float) -> list[Car]:
+    def parked(self, not_colour: str) -> list[Car]:
         names = [name for name in COLOURS_BGR if name != not_colour]
         rng, out = self.rng, list[Car]()
         for number, road in enumerate(self.roads):
             crossing = [other.centre for k, other in enumerate(self.roads) if k != number]
             for s in np.arange(road.centre.begin + 5.0, road.centre.end - 5.0, 7.5):
                 for side in (-1.0, 1.0):
-                    if rng.random() > share:
+                    if rng.random() > _PARKED_SHARE:
                         continue
                     place, course = road.centre.at(np.array([s + rng.uniform(-0.8, 0.8)]), side * _PARKING_OFFSET)
                     near = any(other.distance(place)[0] < 11.0 for other in crossing)

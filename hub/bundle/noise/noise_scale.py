@@ -159,15 +159,16 @@ def _hat_matrix_trace(
     blocks = found.blocks[(first // BAND)[:, None, None], inside[:, :, None], inside[:, None, :]]
     # By the four control points of a row, (n, 2, 12).
     by_path = (line.weights[:, None, :, None] * (root * line.point_jacobian)[:, :, None, :]).reshape(-1, 2, BAND)
-    trace = float((by_path @ blocks * by_path).sum())
+    leverage = (by_path @ blocks * by_path).sum(axis=(1, 2))
     if columns:
         shift = -by_path @ by_cameras[3 * line.index[:, None] + np.arange(BAND)]
         parameters = problem.free_columns()[seeing]
         own = np.flatnonzero(parameters // CAMERA_PARAMETERS == rows.camera)
         shift[:, :, own] += root * line.camera_jacobian[:, :, parameters[own] % CAMERA_PARAMETERS]
         shift = shift.reshape(-1, len(seeing))
-        trace += float((shift @ found.free.submatrix(seeing) * shift).sum())
-    return trace * len(used) / len(pick)
+        leverage += (shift @ found.free.submatrix(seeing) * shift).reshape(len(pick), -1).sum(axis=1)
+    # A coordinate has 1 at most; where a path passes through the camera's plane, rounding made it thousands.
+    return float(np.minimum(leverage, 2.0).sum()) * len(used) / len(pick)
 
 
 def modelled_inflation(problem: Problem, state: AdjustmentState, camera: int) -> float:

@@ -20,6 +20,7 @@ from hub.bundle.adjustment import adjust
 from hub.bundle.covariance import middles_of_overlap
 from hub.bundle.initialisation import SEEN_WITHIN_S
 from hub.bundle.noise.clock_wander import Wander, fit_wander
+from hub.bundle.normal_equations import CAUCHY_WIDTH
 from hub.bundle.problem import OFFSET, AdjustmentState, Problem, TrackObservations
 from hub.bundle.residuals import LinearisedResiduals, linearise
 from hub.trajectory.discrete import PointBasis
@@ -40,7 +41,6 @@ _REWEIGHTINGS = 4  # of outliers' weights
 _OUTLIER_SIGMA = 6.0  # sigma beyond which a row or a frame is an outlier
 _MIN_SIGMA_PX = 0.05  # px
 _MAD_TO_SIGMA = 1.4826  # std of a Gaussian from its median absolute value
-_CAUCHY_WIDTH = 4.0  # Cauchy width in sigma of one row, as in the adjustment
 _MAX_JITTER_S = 0.1
 """s: upper limit of the estimated jitter."""
 
@@ -246,7 +246,7 @@ def _independent_shifts(frames: _FrameRows, sigma: float) -> tuple[Floats, Float
         over = 1.0 / np.where(information > 0.0, information, 1.0)
         shift, transverse = -frames.sums(weight * along) * over, frames.sums(weight * across) * over
         left = frames.residual + frames.velocity * shift[frames.frame, None]
-        weight = 1.0 / (1.0 + (left**2).sum(axis=1) / (_CAUCHY_WIDTH * sigma) ** 2)
+        weight = 1.0 / (1.0 + (left**2).sum(axis=1) / (CAUCHY_WIDTH * sigma) ** 2)
     return shift, information, transverse
 
 

@@ -24,7 +24,7 @@ from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior
 from hub.sync.common_clock import solve_common_clock_pair
 from hub.sync.hypothesis import PairFit, PairSolution, evidence
 from hub.sync.pair_ranking import ranking_score
-from hub.sync.pair_solver import solve_pair
+from hub.sync.pair_solver import FRAME_RATES, solve_pair
 from hub.sync.settings import PairSettings
 from hub.sync.track_cache import TrackCache
 from hub.trajectory.image_tracks import smooth_only
@@ -37,7 +37,6 @@ Progress = Callable[[str, float], None]
 
 RATE_TOLERANCE = 0.01
 """Relative rate error above which times must have been made with a wrong frame rate: no clock is off by that much."""
-_FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)  # common ones [1/s]
 _RATIO_TOLERANCE = 0.01  # relative: 29.97 counts as 30
 _SMALL_NETWORK = 8  # cameras up to which all failed guided searches are repeated over all lags
 _MIN_REDUNDANT = 3  # cameras from which on pairs are checked against each other
@@ -472,7 +471,7 @@ def _likely_frame_rates(ratio: float, observed: float) -> tuple[str, str]:
 
     observed: frame rate by the camera's own time stamps.
     """
-    standard = [(a, b) for a in _FRAME_RATES for b in _FRAME_RATES if abs(b / a / ratio - 1.0) < _RATIO_TOLERANCE]
+    standard = [(a, b) for a in FRAME_RATES for b in FRAME_RATES if abs(b / a / ratio - 1.0) < _RATIO_TOLERANCE]
     likely = min(standard, key=lambda pair: abs(pair[0] - observed), default=(observed, observed * ratio))
     return f"{likely[0]:.3g}", f"{likely[1]:.3g}"
 

@@ -36,7 +36,7 @@ _BRIDGED_S = 0.2  # between two rows of a tracklet, in which a joint moves on a 
 _CORRELATION_S = 0.3  # keypoint errors of a stride or a turn of the head: one independent sample
 # The alternative to one person is another one somewhere near: joints then miss the epipolar line by a share of a body.
 _OTHER_SHARE = 0.15  # of the image's height: std of that miss
-_MIN_NOISE_PX = 2.0
+_MIN_NOISE_PX = 2.0  # keypoints are no more exact, however well the few rows of a fit agree
 _FLOOR = -3.0  # log-likelihood ratio of one joint: wrong keypoints
 _PAUSE_S, _TAIL = 1.0, 5  # s that a person may be lost or confused in one camera; frames that give the velocity
 _STEP_STD, _DRIFT_STD = 0.03, 0.3  # of a person's size, and per second of the pause

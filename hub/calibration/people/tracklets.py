@@ -20,9 +20,9 @@ _MIN_JOINTS = 3  # that people have in common: fewer are no body
 _MAX_COST = 0.3
 _CONFUSED_RATIO, _CONFUSED_MARGIN = 2.0, 0.03  # another link that costs less than this ratio plus margin
 _MAX_PAUSE_S = 0.35  # after which the velocity says nothing
-_MAX_MISSED_FRAMES = 3
-_MIN_FRAMES = 5
-_VELOCITY_GAIN = 0.5
+_MAX_MISSED_FRAMES = 3  # of slow cameras, whose pauses may then be longer
+_MIN_FRAMES = 5  # that give a velocity at a tracklet's ends (_TAIL of association.py)
+_VELOCITY_GAIN = 0.5  # of a frame: less lags behind turns, more follows the keypoints' jitter
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -43,7 +43,7 @@ _MIN_COMMON_S = 3.0
 _SCALES = [np.array([mirror * scale, scale]) for mirror in (1.0, -1.0) for scale in np.geomspace(0.5, 2.0, 17)]
 """Scales of an image about its centre, mirrored or not, that are tried where a camera fits at no lag: no view is so
 wide or narrow that a lens is mistaken by more."""
-_SCALE_STEPS = (1.04, 1.02, 1.01, 1.005)
+_SCALE_STEPS = (1.04, 1.02, 1.01, 1.005)  # half of the step of _SCALES, then half of that, and so on
 LIKELY_CANDIDATES, _MIN_SCALE_CHANGE = 4, 0.03
 """Candidates of the moment scan, which does not use the lens, whose scale is searched; scale that the lens gives."""
 _TRIMS = 2  # fits of a pose to the better half of the points

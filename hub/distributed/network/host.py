@@ -37,7 +37,7 @@ from protocols.session.observations import DEFAULT_LABEL
 
 ROLE = "nodes"
 """Role under which a hub that hosts pose nodes is announced."""
-_UPDATE_PERIOD_S = 0.1  # s: ten publications a second
+UPDATE_PERIOD_S = 0.1  # s: ten publications a second
 _UPDATE_OBSERVATIONS = 40
 """Observations after which the nodes are updated even if no time has passed, for a hub that has a backlog."""
 _CHECKPOINT_UPDATES = 5
@@ -149,7 +149,7 @@ class NodeHost:
         if self._began is None:
             self._began = now
         if now >= self._due:
-            self._due = now + _UPDATE_PERIOD_S
+            self._due = now + UPDATE_PERIOD_S
             self._out += self._release()
             self._take_over()
             self._update()

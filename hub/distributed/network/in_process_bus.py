@@ -41,11 +41,11 @@ class InProcessNetwork:
             for neighbour in self.nodes[state.camera].neighbours():
                 self._record(self.nodes[neighbour].handle(state))
 
-    def run_until_converged(self, max_updates: int, tolerance: float = 1e-7) -> int:
-        """Update until no camera moves by more than ``tolerance`` in ten updates, at most ``max_updates`` times.
+    def run_until_converged(self, max_updates: int) -> int:
+        """Update until no camera moves by more than 1e-7 in ten updates, at most ``max_updates`` times.
 
-        tolerance: [rad] relative to the first camera, and as a share of the largest distance from it. Returns the
-        number of updates.
+        1e-7 rad relative to the first camera, and as a share of the largest distance from it. Returns the number of
+        updates.
         """
         for node in self.nodes.values():
             node.relinearise_all()
@@ -55,7 +55,7 @@ class InProcessNetwork:
             if count % 10 == 0:
                 now = self._normalised_poses()
                 complete = len(now) == len(self.nodes) or count >= _MAX_JOINING_UPDATES
-                if complete and before.shape == now.shape and float(np.abs(now - before).max(initial=0.0)) < tolerance:
+                if complete and before.shape == now.shape and float(np.abs(now - before).max(initial=0.0)) < 1e-7:
                     return count
                 before = now
         return max_updates

@@ -65,7 +65,7 @@ _TIMEOUT_UPDATES = 20
 """Updates without a message after which a neighbour no longer reduces the step."""
 _CONVERGED_CHI2, _CONVERGED_UPDATES = 9.0, 5
 """Largest predicted chi2 decrease of a step, and for how many successive updates, for the moved-camera test."""
-_CONTRADICTION_COST = 60.0
+_CONTRADICTION_COST = 60.0  # half chi2 of six numbers: 4.5 stds on each, never by chance
 _MAX_CONTRADICTIONS = 30  # in succession, before the pose is started anew
 
 
@@ -83,7 +83,6 @@ class PoseNode:
         boot: int = 0,
         control_point: ControlPoint | None = None,
         seed: int = 0,
-        depth: int = 0,
         raw: int = RAW_CAPACITY,
         gap: float = MAX_GAP_S,
     ) -> None:
@@ -97,7 +96,7 @@ class PoseNode:
         self.refused: Counter[str] = Counter()
         self.updates = 0
         self.frame_age = 0
-        self._depth = depth
+        self._depth = 0
         self._raw = raw
         self._extrapolated: Pose | None = self.pose
         self._momentum = 0

@@ -12,6 +12,7 @@ from hub.distributed.network.messages import Anchor, ControlPoint, StateMessage
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
+from protocols.validation.codec import SCHEMA_VERSION
 
 _UPPER = np.triu_indices(6)
 _LONGEST = 63
@@ -31,7 +32,7 @@ def name_of(number: int) -> str:
 def state_to_wire(state: StateMessage, host: str, takeover: int) -> pb.NodeState:
     """The state as a message, without factors."""
     message = pb.NodeState(
-        schema_version=1,
+        schema_version=SCHEMA_VERSION,
         camera=name_of(state.camera),
         host=host,
         takeover=takeover,

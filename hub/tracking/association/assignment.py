@@ -18,7 +18,7 @@ from hub.tracking.filter.measurement import (
     PredictedMeasurement,
     student_t_inflation,
 )
-from hub.tracking.filter.target_models import TARGET_MODELS
+from hub.tracking.filter.target_models import CLUTTER_COLOUR_STD
 from hub.tracking.filter.target_states import Targets
 from protocols.geometry.types import Bools, Floats, Ints
 
@@ -31,23 +31,19 @@ _LOG_OUTLIER = float(np.log(0.05))
 """Of a head or foot outside its gate, while the point is inside: occluded or merged silhouettes, one in twenty."""
 _CLUTTER_RADIUS = 0.25
 """Head and foot of a false detection lie anywhere within a quarter of its size of where a target's would be."""
-_CLUTTER_COLOUR_STD = 60.0
-"""Of a channel of false detections and of other people."""
 COLOUR_STD = 28.0
 """Largest std of one channel between cameras: light and white balance differ. Adapted by `update_colour_variance`."""
 _MIN_COLOUR_STD, _COLOUR_STD_FACTOR = 14.0, 2.0
 """Smallest std, and the factor by which the estimated std is widened: a box also holds parts of other people."""
 _CERTAIN, _COLOUR_VARIANCE_GAIN = 0.05, 0.002
 """Pairs with a larger mismatch probability do not adapt the colour variance; gain of one that does."""
-_COLOUR_MAX = 24.0
+_COLOUR_MAX = 24.0  # chi-squared of three channels: once in 40,000 by chance, a shadow or a wrong box
 _LOG_CAMERA_MATCH = 1.0
 """Added where the camera's own tracker matched the detection to the target."""
 _MIN_WEIGHT = 0.1
 """Fraction of the weight that a detection keeps when it fits another target equally well."""
-_WIDTH = 0.2
-_LENGTH = 0.6
+_WIDTH, _LENGTH = 0.2, 0.6
 """Silhouettes touch within these fractions of the sum of two lengths, across and along the body."""
-_UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +118,7 @@ def _blocks(matrix: Floats) -> Floats:
 def colour_score(observed: Floats, stored: Floats, std: float) -> Floats:
     """Log likelihood ratios (k,) of colours (k, 3) of detections and targets against anything else's; 0 if unknown."""
     off2 = ((observed - stored) ** 2).sum(axis=1)
-    score = 3.0 * np.log(_CLUTTER_COLOUR_STD / std) - 0.5 * np.minimum(off2 / std**2, _COLOUR_MAX)
+    score = 3.0 * np.log(CLUTTER_COLOUR_STD / std) - 0.5 * np.minimum(off2 / std**2, _COLOUR_MAX)
     return np.asarray(np.nan_to_num(score))
 
 

@@ -9,15 +9,14 @@ from scipy.spatial import cKDTree
 
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY, log_density
 from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis, log_mixture
-from hub.tracking.filter.target_models import TARGET_MODELS
+from hub.tracking.filter.target_models import CLUTTER_COLOUR_STD, TARGET_MODELS
 from hub.tracking.filter.target_states import Targets
 from protocols.geometry.types import Floats, Ints
 
 _REGION_M = 1.5
 """Radius within which entries and exits are counted: a walker's way in a second."""
-_MAX_LINK_M = 6.0
-_CLUTTER_COLOUR_STD, _COLOUR_MAX = 60.0, 12.0
-"""Of a channel of other people's colours; limit of a squared difference, over its variance."""
+_MAX_LINK_M = 6.0  # between where the past would be and the future: farther pairs are not scored
+_COLOUR_MAX = 12.0  # chi-squared of three channels: once in 140 by chance; a shadow or a wrong box
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +98,7 @@ def continuation_scores(
     vertical = np.linalg.eigvalsh(total[:, POSITION, POSITION])[:, 0]
     chance_of = chance[b] + rates[1][b] - 0.5 * np.log(vertical) + np.log(2.0 * np.pi)
     off2 = ((past.colour[a] - future.colour[b]) ** 2).sum(axis=1) / colour_std**2
-    alike = np.nan_to_num(3.0 * np.log(_CLUTTER_COLOUR_STD / colour_std) - 0.5 * np.minimum(off2, _COLOUR_MAX))
+    alike = np.nan_to_num(3.0 * np.log(CLUTTER_COLOUR_STD / colour_std) - 0.5 * np.minimum(off2, _COLOUR_MAX))
     alike[past.initiation_number[a] == future.initiation_number[b]] = 0.0  # one track's colour says nothing of it
     score[a, b] = fit - chance_of - rates[0][a] - gap_s[a] + alike
     return score

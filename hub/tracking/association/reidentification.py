@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY, log_density
 from hub.tracking.filter.manoeuvre import log_mixture, manoeuvre_hypothesis, units_of
 from hub.tracking.filter.prediction import predict_targets
-from hub.tracking.filter.target_models import TARGET_MODELS
+from hub.tracking.filter.target_models import TARGET_MODELS, UPRIGHT
 from hub.tracking.filter.target_states import MultiTargetState, Targets
 from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
@@ -21,13 +21,12 @@ _COLOUR_STD = 18.0
 _LOG_SIZE_STD = 0.05  # of a person's height from one appearance to the next
 _MAX_MOTION_S = 4.0
 """A target lost for longer may be anywhere: only its appearance is compared."""
-_MAX_COST, _MIN_MARGIN = 14.0, 4.0
+_MAX_COST, _MIN_MARGIN = 14.0, 4.0  # chi-squared of colour and size: once in 140 by chance; odds of seven
 _IMPOSSIBLE = 1e6  # above all costs
-_SPEED_FACTOR = 2.5
+_SPEED_FACTOR = 2.5  # stds of a kind's velocity: faster once in 80
 _COASTING_S = 0.4
 """A person without detections for this long, and for one and a half frames, may be the one that begins again; a
 marker, of which there are few and which may change its velocity abruptly, after a quarter of a frame."""
-_UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 _SPEED = np.array([model.speed_std_m_s for model in TARGET_MODELS])
 
 
@@ -38,7 +37,7 @@ def reidentify(state: MultiTargetState, ready: Bools, parameters: TrackerParamet
     assert state.time_ns is not None
     targets = state.targets
     number, keep = targets.number.copy(), np.ones(len(targets), dtype=np.bool_)
-    unseen_s = np.where(_UPRIGHT[targets.kind], max(_COASTING_S, 1.5 * state.interval_s), 0.25 * state.interval_s)
+    unseen_s = np.where(UPRIGHT[targets.kind], max(_COASTING_S, 1.5 * state.interval_s), 0.25 * state.interval_s)
     coasting = np.flatnonzero(targets.confirmed & ((state.time_ns - targets.seen_ns) / NANOSECONDS > unseen_s))
     new = np.flatnonzero(ready)
     lost = state.lost.concatenate(targets.select(coasting))
@@ -114,7 +113,7 @@ def _dissimilarity(lost: Targets, lost_ns: Floats, new: Targets, time_ns: int, p
         # No colour known: only soon after and nearby.
         colour = ((new.colour[i] - lost.colour) ** 2).sum(axis=1) / _COLOUR_STD**2
         colour = np.where(np.isnan(colour), np.where(soon, 3.0, 3.0 + _MAX_COST), colour)
-        size = np.where(_UPRIGHT[lost.kind], (new.mean[i, LOG_SIZE] - lost.mean[:, LOG_SIZE]) ** 2, 0.0)
+        size = np.where(UPRIGHT[lost.kind], (new.mean[i, LOG_SIZE] - lost.mean[:, LOG_SIZE]) ** 2, 0.0)
         total = colour + size / _LOG_SIZE_STD**2 + np.where(soon, 2.0 * (best - fit), 0.0)
         cost[i, possible] = total[possible]
     return cost

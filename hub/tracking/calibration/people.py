@@ -24,15 +24,15 @@ _MAX_GAP_S = 0.6
 """A tracklet without a detection for longer than this ends."""
 _MAX_STEP = 0.45
 """Largest displacement of a point between two frames 0.1 s apart, as a fraction of the size."""
-_COLOUR_GATE = 60.0
+_COLOUR_GATE = 60.0  # root mean square of the channels: as much as other people's colours differ
 _TOUCHING_DISTANCE = 0.45
 """Silhouettes nearer than this fraction of the size may be confused: both tracklets end there."""
 _MAX_SIZE_RATIO = 1.12
 """Largest ratio of a size to its recent mean; beyond, the sample is skipped."""
-_MIN_SAMPLES = 8
+_MIN_SAMPLES = 8  # of a tracklet: fewer give no mean colour to tell people by
 _CLUSTER_RADIUS = 38.0
 """Largest difference of the mean colours of tracklets of one person (root mean square of the channels)."""
-_MIN_COLOUR_GATE = 10.0
+_MIN_COLOUR_GATE = 10.0  # at least, around a person's colour: samples of plain clothes hardly spread
 _MIN_COMMON_S = 6.0
 """People seen by two cameras for a shorter time are not used."""
 

@@ -10,7 +10,7 @@ from protocols.geometry.types import Floats
 
 _MIN_PEOPLE = 60
 """Detections with head and foot before an estimate is given."""
-_MAX_COUNT = 20_000.0
+_MAX_COUNT = 20_000.0  # detections of a camera, eleven minutes of one person at 30 fps: older ones fade
 _MAX_EIGENVALUE_RATIO = 0.15
 """Largest ratio of the smallest to the middle eigenvalue: people tilt, but all views must agree on one direction."""
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from hub.tracking.filter import kalman
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
-from hub.tracking.filter.target_models import TARGET_MODELS
+from hub.tracking.filter.target_models import TARGET_MODELS, UPRIGHT
 from hub.tracking.filter.target_states import Targets
 from protocols.geometry.types import Bools, Floats
 
@@ -22,7 +22,6 @@ _MAX_SPREAD_M = 0.7
 _STEP_S = 0.5  # of one step: 120 a minute
 _MANOEUVRE_STD = np.array([model.manoeuvre_std_m_s for model in TARGET_MODELS])
 _MANOEUVRE_RATE = np.array([model.manoeuvres_per_s for model in TARGET_MODELS])
-_UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,10 +52,10 @@ def manoeuvre_hypothesis(
     std = _MANOEUVRE_STD[targets.kind] * units_of(targets, units_per_m)
     axes = np.broadcast_to(np.eye(3), (len(targets), 3, 3))
     if up is not None:
-        axes = axes - _UPRIGHT[targets.kind][:, None, None] * np.outer(up, up)
+        axes = axes - UPRIGHT[targets.kind][:, None, None] * np.outer(up, up)
     change = (std**2)[:, None, None] * axes
     covariance = targets.covariance.copy()
-    step = np.where(_UPRIGHT[targets.kind], np.minimum(np.abs(time), _STEP_S), 0.0)
+    step = np.where(UPRIGHT[targets.kind], np.minimum(np.abs(time), _STEP_S), 0.0)
     covariance[:, POSITION, POSITION] += change * ((time**2 + step**2) / 3.0)[:, None, None]
     covariance[:, POSITION, VELOCITY] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, POSITION] += change * (time / 2.0)[:, None, None]
@@ -79,7 +78,7 @@ def within_reach(targets: Targets, elapsed: Floats, hypothesis: ManoeuvreHypothe
 def units_of(targets: Targets, units_per_m: float) -> Floats:
     """World units per metre (n,), of upright targets by their own size: the world's scale may be unknown."""
     typical = np.array([model.size_m for model in TARGET_MODELS])[targets.kind]
-    return np.where(_UPRIGHT[targets.kind], np.exp(targets.mean[:, LOG_SIZE]) / typical, units_per_m)
+    return np.where(UPRIGHT[targets.kind], np.exp(targets.mean[:, LOG_SIZE]) / typical, units_per_m)
 
 
 def widened_by_evidence(

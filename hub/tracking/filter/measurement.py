@@ -12,10 +12,10 @@ import numpy as np
 
 from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, VELOCITY
-from hub.tracking.filter.target_models import TARGET_MODELS
+from hub.tracking.filter.target_models import TARGET_MODELS, UPRIGHT
 from protocols.geometry.types import Bools, Floats, Ints
 
-MEASUREMENT_DIM = 7
+MEASUREMENT_DIM = 7  # three points and a size
 POINT, HEAD, FOOT, LOG_IMAGE_SIZE = slice(0, 2), slice(2, 4), slice(4, 6), 6
 BLOCKS = (POINT, HEAD, FOOT, slice(LOG_IMAGE_SIZE, MEASUREMENT_DIM))
 _LOG_SIZE_STD = 0.08
@@ -24,7 +24,6 @@ _MIN_DEPTH = 1e-3  # m: nearer points have no image
 _STUDENT_T_DOF = 4.0
 """Degrees of freedom of the Student's t noise of heads and feet: truncated or merged silhouettes cause outliers."""
 
-_UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
 _ALONG = np.array([(model.point_offset, 0.5, -0.5) for model in TARGET_MODELS])
 """Of point, head and foot above the centre, in sizes."""
 _POINTS_VARIANCE = np.array(
@@ -68,7 +67,7 @@ def predict_measurement(camera: TrackingCamera, mean: Floats, kind: Ints, up: Fl
     n = len(mean)
     rotation = camera.pose.rotation
     size = np.exp(mean[:, LOG_SIZE])
-    upright = _UPRIGHT[kind] & (up is not None)
+    upright = UPRIGHT[kind] & (up is not None)
     axis = rotation @ up if up is not None else np.zeros(3)
     centre = (mean[:, POSITION] - camera.pose.position) @ rotation.T
     depth = centre[:, 2]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 
 @dataclass(frozen=True, slots=True)
 class TargetModel:
@@ -40,3 +42,5 @@ VEHICLE = TargetModel("vehicle", False, 1.8, 0.5, 6.0, 3.0, 0.0, 0.05)
 MARKER = TargetModel("marker", False, 0.1, 1.5, 1.5, 2.0, manoeuvre_std_m_s=4.0, manoeuvres_per_s=0.3)
 TARGET_MODELS = (PERSON, VEHICLE, MARKER)
 KIND_INDEX = {model.kind: index for index, model in enumerate(TARGET_MODELS)}
+UPRIGHT = np.array([model.upright for model in TARGET_MODELS])
+CLUTTER_COLOUR_STD = 60.0  # of a channel of false detections and of other people

@@ -16,8 +16,6 @@ from protocols.geometry.types import Bools, Floats, Ints
 if TYPE_CHECKING:
     from hub.tracking.association.initiation import UnassociatedDetection
 
-TENTATIVE, CONFIRMED = 0, 1
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Targets:

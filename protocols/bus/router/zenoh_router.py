@@ -35,12 +35,12 @@ class RulesChanged(Exception):
 class Router(Closing):
     """Relays between connected clients while the context is open.
 
-    listen: endpoints; more routers to join in connect. config: a complete configuration instead, with certificates and
-    access rules. Raises InputError if an address is taken.
+    listen: endpoints. config: a complete configuration instead, with certificates and access rules. Raises InputError
+    if an address is taken.
     """
 
-    def __init__(self, *listen: str, connect: tuple[str, ...] = (), config: BusConfig | None = None) -> None:
-        config = config or BusConfig(mode="router", listen=listen or (LOOPBACK_ROUTER,), connect=connect)
+    def __init__(self, *listen: str, config: BusConfig | None = None) -> None:
+        config = config or BusConfig(mode="router", listen=listen or (LOOPBACK_ROUTER,))
         self.listen = config.endpoints()[1]
         self._session = open_session(config)
 

@@ -20,6 +20,7 @@ from google.protobuf.message import Message
 
 from protocols.bus.base import AgentEvent, AgentWatch, Bus, Publisher, Received, Refusal, Subscription
 from protocols.core.closing import Closing
+from protocols.core.ranges import MAX_CAMERAS
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS, TOPICS, Topic
 from protocols.validation.rules import MAX_NUMBERS, RejectionReason
@@ -27,7 +28,7 @@ from protocols.validation.rules import MAX_NUMBERS, RejectionReason
 _ROLES = {topic.name: topic.key.partition("/")[0] for topic in TOPICS}
 SOURCE_TIMEOUT_S = 10.0
 """Silence after which a boot may use another connection: a log that is replayed twice has the same boot ids."""
-_MAX_SOURCES = _MAX_AGENTS = 4096
+_MAX_SOURCES = _MAX_AGENTS = 4 * MAX_CAMERAS  # of a hub: invented names cannot fill the memory
 _MAX_HEARD = 16
 """Boots of one agent whose late messages are accepted, and that may be alive at once."""
 _PUBLISHED_SOURCES = 48  # of rejections in a status, whose counters are bounded

@@ -6,16 +6,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge import scenes
 from edge.detectors.marker.ball import MarkerDetector
 from edge.detectors.marker.tag import TagDetector
+from protocols.geometry.types import Image
 from tests.bench import people_detector
 from tests.bench.speed.rows import Limit, Row, Section, interleaved
 from tests.support.rendered_markers import add_tag, dim_room, exposed, tag_image
 
-Image = npt.NDArray[np.uint8]
 _HD = (1280, 720)
 _LOW, _HIGH = (5, 120, 80), (18, 255, 255)  # the ball's orange
 

@@ -9,11 +9,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-Image = npt.NDArray[np.uint8]
 Colour = tuple[int, int, int]
 _SHIFT = 4  # bits of OpenCV's fixed-point coordinates
 _NEAR_M = 0.5  # m: nearer faces are clipped

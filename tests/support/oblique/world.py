@@ -7,16 +7,13 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.uav.base import Box
 from edge.uav.world.noise import smoothed_noise, value_noise
 from protocols.core.errors import InputError
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 from tests.support.oblique import bodies
 from tests.support.oblique.bodies import Body, View
-
-Image = npt.NDArray[np.uint8]
 
 TARGETS = ("car", "bicycle", "person", "boat")
 FLIGHTS = ("follow", "orbit", "zoom", "away")

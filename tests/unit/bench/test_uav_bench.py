@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
-from edge.uav.base import Box, Estimate, Hypothesis, Image, Telemetry, TrackState
+from edge.uav.base import Box, Estimate, Hypothesis, Telemetry, TrackState
 from edge.uav.world import scenarios
 from edge.uav.world.flight_world import FlightWorld, GroundTruth
 from protocols.core.errors import EXIT_DONE
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 from protocols.session.rig import read_rig
 from tests.bench import real_rigs, uav_aerial
 from tests.bench.uav_scoring import Score, score

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from edge.detectors.moving.bootstrap import BackgroundBootstrap, sorting_network
+from protocols.geometry.types import Image
 
-Image = npt.NDArray[np.uint8]
 WIDTH, HEIGHT = 320, 96
 PERIOD_S = 0.1
 NOISE = 3.0

@@ -26,9 +26,9 @@ from edge.detectors.people.person import PersonDetector, clean_silhouettes, silh
 from edge.detectors.people.segmentation import segment_people
 from edge.detectors.people.silhouettes import IsolatedPeople
 from edge.scenes import renderer_for
+from protocols.geometry.types import Image
 from tests.support.people_boxes import score_boxes
 
-Image = npt.NDArray[np.uint8]
 HEIGHT, WIDTH = 240, 320
 
 

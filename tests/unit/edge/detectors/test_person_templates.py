@@ -9,9 +9,9 @@ from edge.detectors.people import occupancy
 from edge.detectors.people.height_model import HeightModel
 from edge.detectors.people.person import silhouette_features
 from edge.detectors.people.segmentation import segment_people
-from edge.detectors.people.silhouettes import Image, IsolatedPeople, _touching_all_sides
+from edge.detectors.people.silhouettes import IsolatedPeople, _touching_all_sides
 from edge.detectors.people.templates import BARS, SilhouetteRegion, Template
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 WIDTH, HEIGHT = 320, 240
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.uav.base import Basis, Box, Estimate, Image, Telemetry, TrackState
+from edge.uav.base import Basis, Box, Estimate, Telemetry, TrackState
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.filter import CorrelationFilter, windowed
 from edge.uav.correlation.oriented_box import OrientedBox, crop
@@ -14,6 +14,7 @@ from edge.uav.correlation.scale import BoxFlow
 from edge.uav.image_motion.scene_motion import STILL, SceneMotion
 from edge.uav.tracker_factory import make_tracker
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Image
 from tests.support.oblique.world import ObliqueWorld
 
 SIZE = (320, 240)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge.uav.adaptive_tracker import AdaptiveTracker
-from edge.uav.base import Basis, Box, Estimate, Image, TrackState
+from edge.uav.base import Basis, Box, Estimate, TrackState
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.belief import Belief
 from edge.uav.correlation.candidate import Candidate, Kinematics
@@ -23,6 +23,7 @@ from edge.uav.image_motion.first_motion import FirstMotion
 from edge.uav.image_motion.median_background import MedianBackground
 from edge.uav.image_motion.residual import UNKNOWN, MovingParts, Residual
 from edge.uav.image_motion.scene_motion import Motion, SceneMotion
+from protocols.geometry.types import Image
 
 SIZE = (320, 240)
 FPS = 15.0

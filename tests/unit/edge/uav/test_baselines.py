@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.uav.base import Box, Image, Tracker, TrackState
+from edge.uav.base import Box, Tracker, TrackState
 from edge.uav.baselines import histograms, regions, road
 from edge.uav.baselines.background import BackgroundFilter, BackgroundMotion, predicted_flow
 from edge.uav.baselines.car_models import move_with_background
@@ -17,7 +17,7 @@ from edge.uav.baselines.plain_tracker import AppearanceTest, PlainTracker
 from edge.uav.baselines.road_filter import RoadFilter, align_to_edges, line_support
 from edge.uav.baselines.white_lines import EdgeDistance, find_sections
 from protocols.core.errors import InputError
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
 SIZE = (640, 480)
 CENTRE = np.array([319.5, 239.5])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -28,9 +27,8 @@ from edge.uav.target.tracklets import Tracklet, Tracklets
 from edge.uav.timing.telemetry_track import TelemetryTrack
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-Image = npt.NDArray[np.uint8]
 PLANE = ImagePlane((320, 240), None)
 FROM_ABOVE = np.diag([10.0 / PLANE.focal, 10.0 / PLANE.focal, 1.0])  # 10 px a unit, origin in the middle
 

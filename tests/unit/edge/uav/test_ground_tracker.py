@@ -14,9 +14,8 @@ from edge.uav.tracker_factory import make_tracker
 from edge.uav.world import scenarios
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Image
 
-Image = npt.NDArray[np.uint8]
 SIZE = (320, 240)
 FPS = 30.0
 CAR = (36, 16)

@@ -12,7 +12,7 @@ import pytest
 from google.protobuf.message import Message
 
 from hub.live.agent import status_message
-from hub.live.budgets import MAX_CAMERAS, CameraBudgets
+from hub.live.budgets import CameraBudgets
 from hub.live.fair_share import FairShare
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
 from hub.live.messages import refusal_message
@@ -22,6 +22,7 @@ from protocols.bus.base import Received
 from protocols.bus.security.sender_identity import SenderCheckedBus
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.core.ranges import MAX_CAMERAS
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
