@@ -111,10 +111,10 @@ def wrong_lens(problem: Problem, state: AdjustmentState) -> ScoreTest | None:
 
 
 def _wrong_geometry(problem: Problem, state: AdjustmentState) -> ScoreTest | None:
-    """Of fewer cameras than `wrong_lens` blames one of: a lens refuted so far that it or the geometry is wrong."""
+    """Of fewer cameras than `wrong_lens` blames one of: the lens refuted most, if so far that it or the geometry is."""
     if len(state.cameras) >= _MIN_TO_BLAME_A_LENS or not problem.free_parameters.clock:
         return None
-    found = refuted_lenses(problem, state, LENS, LENS[:2])
+    found = refuted_lenses(problem, state, LENS, LENS[:2])[:1]  # with two of three lenses free, the third is anything
     return next((one for one in found if _excess(one, problem, far=False) * _WRONG_LENS > _WRONG_GEOMETRY), None)
 
 
