@@ -140,6 +140,7 @@ def apply_step(problem: Problem, state: AdjustmentState, path_step: Floats, came
     return replace(state, cameras=cameras, trajectories=tuple(paths))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a step far too long, whose cost is no number
 def apply_camera_step(camera: CameraState, step: Floats) -> CameraState:
     """The camera after a step (18,) of its parameters."""
     pose = Pose(so3.exp(step[:3]) @ camera.pose.rotation, camera.pose.position + step[3:6])
