@@ -41,7 +41,10 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import AdjustmentStep
 
 _OUTLIER_SIGMA = 5.0  # rows beyond this many sigma are rejected as outliers
-_COARSE_TOLERANCE, _FINE_TOLERANCE = 1e-4, 1e-7  # relative decrease of the cost that ends a round, and the last one
+_COARSE_TOLERANCE, _FINE_TOLERANCE = 1e-4, 1e-9  # relative decrease of the cost that ends a round, and the last one
+_FINE_ITERATIONS = 10
+"""Times those of a round. Through narrow lenses a turn about the scene hardly changes the cost, and steps are short:
+with 1 and 1e-7 7 of 150 simulated rigs of two and three cameras ended beyond 5 stds (up to 23°), so 3 (CPU +10 %)."""
 
 
 def adjust(
@@ -76,7 +79,7 @@ def adjust(
         if progress is not None:
             progress(f"adjustment {round_index + 1}/{rounds}: {float(np.median(state.sigma)):.2f} px")
     if not coarse:
-        state = minimise(problem, state, prior, robust, iterations, _FINE_TOLERANCE, steps, coarse)
+        state = minimise(problem, state, prior, robust, _FINE_ITERATIONS * iterations, _FINE_TOLERANCE, steps, coarse)
         state = replace(state, sigma=estimate_noise(problem, state, prior))
     return problem, replace(state, steps=tuple(steps)), prior
 
@@ -139,6 +142,7 @@ def apply_step(problem: Problem, state: AdjustmentState, path_step: Floats, came
     return replace(state, cameras=cameras, trajectories=tuple(paths))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a step far too long, whose cost is no number
 def apply_camera_step(camera: CameraState, step: Floats) -> CameraState:
     """The camera after a step (18,) of its parameters."""
     pose = Pose(so3.exp(step[:3]) @ camera.pose.rotation, camera.pose.position + step[3:6])

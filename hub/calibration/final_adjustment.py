@@ -158,7 +158,7 @@ def final_adjustment(
         if _bic_prefers(freed_problem, freed_state, problem, state, 2 * len(state.cameras)):
             problem, state = freed_problem, freed_state
     adjusted = replace(reconstruction, problem=problem, state=state)
-    if not online and (misfits(adjusted) or wrong_lens(problem, state)):
+    if misfits(adjusted) or wrong_lens(problem, state):
         return adjusted  # a camera that will be left out: its errors are no noise
     report("correlated noise", 0.92)
     refit = _refit_online if online else refit_with_correlated_noise

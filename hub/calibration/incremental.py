@@ -24,7 +24,7 @@ from hub.bundle.initialisation import (
 )
 from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, ClockStep, FreeParameters
-from hub.calibration.acceptance import least_certain_camera, misfits
+from hub.calibration.acceptance import larger_residuals, misfits, network_failure
 from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, final_adjustment
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
@@ -151,9 +151,15 @@ def update_calibration(
             _free_parameters(prepared),
         )
         reasons |= unplaced
+    near = not larger_residuals(reconstruction, last.cameras)  # else rows that the last answer explained no longer fit
     reconstruction, failures, misfitting = _adjust_without_failures(
-        prepared, reconstruction, refused | reasons, warm=not full, refine_lenses=refine_lenses
+        prepared, reconstruction, refused | reasons, warm=not full and near, refine_lenses=refine_lenses
     )
+    larger = larger_residuals(reconstruction, last.cameras)
+    if larger and len(reconstruction.names) == 2:  # each hides in the other's path, as far as this can follow
+        texts = {name: f"residuals of {sigma:.1f} px, {rms:.1f} px before" for name, (sigma, rms) in larger.items()}
+        listed = "; ".join(f"{name}: {text}" for name, text in texts.items())
+        raise Refused(f"the rows contradict the calibration ({listed}): a camera was moved, or its clock set", texts)
     reasons, refuted = reasons | failures, {*moved, *misfitting}
     joint = tuple(pair for pair in pairs if pair.solved) + _tied_pairs(reconstruction.names, pairs)
     solution = Solution(
@@ -256,7 +262,7 @@ def _adjust_without_failures(
     warm: bool,
     refine_lenses: bool,
 ) -> tuple[Reconstruction, dict[str, str], set[str]]:
-    """The adjusted network without cameras that fail, their reasons, and which of them do not fit the trajectory.
+    """The adjusted network without cameras that fail, their reasons, and which of them the rows refute.
 
     refused: reasons so far. Raises Refused where fewer than two cameras are left.
     """
@@ -265,15 +271,13 @@ def _adjust_without_failures(
         reconstruction = final_adjustment(
             reconstruction, lambda text, share: None, warm=warm, online=True, refine_lenses=refine_lenses
         )
-        failure = next(iter(misfits(reconstruction)), None)
-        if failure is not None:
-            refuted.add(failure[0])
-        else:
-            failure = least_certain_camera(reconstruction)
+        failure = next(iter(misfits(reconstruction)), None) or network_failure(reconstruction, (), {})
         if failure is None:
             return reconstruction, reasons, refuted
         worst, reason = failure[0], failure[1].reason
         reasons[worst] = reason
+        if not failure[1].name.startswith("std of"):  # of which the rows say too little
+            refuted.add(worst)
         remaining = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
         del remaining[worst]
         if len(remaining) < 2:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -51,9 +51,6 @@ from protocols.core.errors import Refused
 from protocols.session.calibration import Calibration, FixedCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
-
-if TYPE_CHECKING:
-    from hub.distributed.solver import DistributedPoseSolver
 
 _LENS_ITERATIONS = 3  # a bound: it stops where no lens changes
 _SMALL_BODY = 4  # points of a single tag
@@ -133,9 +130,9 @@ def calibrate(
         elif solver == "distributed":
             from hub.distributed.solver import DistributedPoseSolver
 
-            solution = solve_network(
-                prepared, pairs, report, DistributedPoseSolver(rig, prepared, observations, report, seed)
-            )
+            nodes = DistributedPoseSolver(rig, prepared, observations, report, seed)
+            solution = solve_network(prepared, pairs, report, nodes)
+            solution = replace(solution, solver="distributed", warnings=solution.warnings + nodes.warnings)
         else:
             solution = solve_with_unknown_lenses(
                 rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
@@ -292,7 +289,7 @@ def solve_network(
     prepared: PreparedSession,
     pairs: list[PairSolution],
     report: Progress,
-    distributed_solver: DistributedPoseSolver | None = None,
+    place: Callable[[ClockGraph], tuple[Reconstruction, Mapping[str, str]]] | None = None,
     *,
     online: bool = False,
     refine_lenses: bool = False,
@@ -300,7 +297,8 @@ def solve_network(
 ) -> Solution:
     """One adjusted network from the pairs; cameras that do not fit are refused with a reason.
 
-    distributed_solver: places the cameras with pose nodes; None = incremental reconstruction and bundle adjustment.
+    place: an adjusted network of a clock graph's cameras, and reasons of those that it leaves out; None = incremental
+    reconstruction and bundle adjustment.
     """
     refused = dict(prepared.refused)
     final = partial(final_adjustment, report=report, online=online, refine_lenses=refine_lenses)
@@ -310,8 +308,9 @@ def solve_network(
     with_rate_prior = replace(free_parameters, rate_std=_rate_prior_std(graph, free_parameters.rate_std))
     placed: dict[str, CameraState] = {}
     while True:
-        if distributed_solver is not None:
-            reconstruction, unplaced = distributed_solver(graph)
+        unplaced: Mapping[str, str]
+        if place is not None:
+            reconstruction, unplaced = place(graph)
         else:
             session = prepared.cameras, graph, prepared.rows, prepared.labels
             reconstruction, unplaced = (
@@ -363,11 +362,8 @@ def solve_network(
     warnings = tuple(
         f"pair {pair.a}–{pair.b} contradicts the other pairs and was rejected" for pair in graph.outlier_pairs
     )
-    solver = "joint"
-    if distributed_solver is not None:
-        solver, warnings = "distributed", warnings + distributed_solver.warnings
     refused = in_rig_order(refused, prepared)
-    return Solution(reconstruction, tuple(pairs), refused, prepared, solver, warnings, acceptance=acceptance)
+    return Solution(reconstruction, tuple(pairs), refused, prepared, "joint", warnings, acceptance=acceptance)
 
 
 def _misfit(reconstruction: Reconstruction, name: str) -> str:
@@ -438,19 +434,19 @@ def solve_with_known_poses(
     for name in [name for name in prepared.cameras if name not in known.cameras]:
         refused[name] = "not in the known calibration"
     cameras = {name: camera for name, camera in prepared.cameras.items() if name in known.cameras}
-    inside = replace(prepared, cameras=cameras)
+    inside = replace(prepared, cameras=cameras, refused=refused)
     if len(cameras) > 1 and coincide(*(known.cameras[name].pose.position for name in cameras)):
         raise Refused(f"the known cameras {', '.join(cameras)} are in one place: their rays meet nowhere else", refused)
-    graph = _largest_component(inside, list(cameras), pairs, refused)
     report("adjusting", 0.75)
-    poses = {name: known.cameras[name].pose for name in graph.clocks}
-    reconstruction = reconstruct_with_known_poses(
-        cameras, graph, prepared.rows, prepared.labels, poses, not prepared.shared_clock
-    )
-    problem, state, _ = adjust(reconstruction.problem, reconstruction.state)
-    problem, state = estimate_frame_times(problem, state)
-    converged = replace(reconstruction, problem=problem, state=state)
-    return Solution(converged, tuple(pairs), in_rig_order(refused, prepared), inside, "joint", known=known)
+
+    def place(graph: ClockGraph) -> tuple[Reconstruction, Mapping[str, str]]:
+        poses = {name: known.cameras[name].pose for name in graph.clocks}
+        free_clocks = not prepared.shared_clock
+        start = reconstruct_with_known_poses(cameras, graph, prepared.rows, prepared.labels, poses, free_clocks)
+        problem, state = estimate_frame_times(*adjust(start.problem, start.state)[:2])
+        return replace(start, problem=problem, state=state), {}
+
+    return replace(solve_network(inside, pairs, report, place), known=known)
 
 
 def _largest_component(

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.bundle.adjustment import adjust
-from hub.bundle.initialisation import Reconstruction, inlier_share, reconstruct_with_known_poses
+from hub.bundle.initialisation import Reconstruction, reconstruct_with_known_poses
 from hub.bundle.preprocessing import PreparedSession, prepare
+from hub.calibration.acceptance import larger_residuals, misfits
 from hub.calibration.pairs.pair_network import Progress, coincide
 from hub.calibration.result import trajectory_tables
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
@@ -23,10 +24,6 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration, TrajectoryTable
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
-
-_MIN_INLIER_SHARE = 0.5  # share of a camera's rows that must fit the trajectories
-_MAX_RELATIVE_RESIDUAL = 0.015  # of the image width: with larger residuals the calibration is not that of the recording
-_RMS_WARNING_FACTOR, _MIN_WARNING_PX = 4.0, 2.0  # times the calibration's rms; px: above both a warning is given
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,14 +62,8 @@ def triangulate(
             raise Refused(f"the cameras {', '.join(names)} are in one place: their rays meet nowhere else", unused)
         report("adjusting the trajectories", 0.4)
         reconstruction = _reconstruct(prepared, known, names)
-        worst = min(reconstruction.names, key=lambda name: inlier_share(reconstruction, name)[0])
-        share, count = inlier_share(reconstruction, worst)
-        misfits = [
-            name
-            for name, sigma in _sigmas(reconstruction).items()
-            if sigma > _MAX_RELATIVE_RESIDUAL * known[name].intrinsics.width
-        ]
-        if share >= _MIN_INLIER_SHARE and not misfits:
+        failures = misfits(reconstruction)
+        if not failures:
             break
         if len(reconstruction.names) == 2:
             residuals = ", ".join(f"{name} {sigma:.1f} px" for name, sigma in _sigmas(reconstruction).items())
@@ -81,9 +72,8 @@ def triangulate(
             refusal.permanent = True
             raise refusal
         # Of three and more, the camera that fits worst is removed, and the trajectories are estimated without it.
-        unused[worst] = (
-            f"only {100 * share:.0f} % of its {count} rows fit the trajectories of the other cameras: was it moved?"
-        )
+        worst = failures[0][0]
+        unused[worst] = f"{failures[0][1].reason}: was it moved?"
         names = [name for name in names if name != worst]
     report("covariances", 0.8)
     tables = _on_reference_clock(rig, prepared, known, reconstruction)
@@ -91,10 +81,8 @@ def triangulate(
         raise Refused("no label is seen by two cameras within 0.2 s of each other", unused)
     sigmas = _sigmas(reconstruction)
     warnings = list(prepared.warnings)
-    for name, sigma in sigmas.items():
-        calibrated_rms = known[name].rms_px
-        if calibrated_rms > 0 and sigma > max(_RMS_WARNING_FACTOR * calibrated_rms, _MIN_WARNING_PX):
-            warnings.append(f"{name}: residuals of {sigma:.1f} px, {calibrated_rms:.1f} px when it was calibrated")
+    for name, (sigma, calibrated_rms) in larger_residuals(reconstruction, known).items():
+        warnings.append(f"{name}: residuals of {sigma:.1f} px, {calibrated_rms:.1f} px when it was calibrated")
     triangulated = {table.label for table in tables if len(table.time)}
     return Triangulation(
         tuple(table for table in tables if len(table.time)),

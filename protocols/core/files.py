@@ -60,6 +60,9 @@ def read_text(file: Path, what: str = "file", most: int = MAX_TEXT) -> str:
         raise InputError("cannot be read: it is not UTF-8 text", file=file, remedy="save it as UTF-8 text") from None
 
 
+_LONG_INTEGER = re.compile(r"[=,\[]\s*[-+]?(?:0[xob])?[0-9a-fA-F_]{19,}")  # as 2**63 in decimal digits
+
+
 def read_toml(file: Path, what: str = "file") -> tuple[dict[str, Any], str]:
     """The parsed TOML file and its text. Raises InputError with file, line and remedy."""
     text = read_text(file, what, MAX_TOML)
@@ -78,9 +81,10 @@ def parse_toml(text: str, file: Path) -> dict[str, Any]:
         _check_integers(values)
         return values
     except (RecursionError, OverflowError):
-        raise InputError(
-            "nested too deeply or a number too large", file=file, remedy="write a plain TOML file"
-        ) from None
+        number = _LONG_INTEGER.search(text)
+        at = text.count("\n", 0, number.end()) + 1 if number else None
+        what = "a number too large" if number else "nested too deeply or a number too large"
+        raise InputError(what, file=file, line=at, remedy="write a plain TOML file") from None
     except ValueError as error:
         message = str(error)
         place = re.search(r"at line (\d+)", message)

@@ -254,7 +254,8 @@ def _serial_inflation(parts: list[tuple[Floats, Floats]], frames: float = 1.0, m
     ]
     steps = np.concatenate([np.diff(time) for time, _ in parts]) if parts else np.zeros(0)
     step = float(np.median(steps)) if len(steps) else 0.0
-    variance = float(np.mean(np.concatenate([residual for _, residual in parts], axis=1) ** 2)) if parts else 0.0
+    residuals = [residual for _, residual in parts]
+    variance = float(np.mean(np.concatenate(residuals, axis=1) ** 2)) if step > 0.0 else 0.0
     if step <= 0.0 or variance <= 0.0:
         return 1.0
     total = 1.0

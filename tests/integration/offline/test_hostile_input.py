@@ -289,7 +289,7 @@ _LENS = "[cam0]\nsize = [640, 480]\n"
         ("[" + ".".join(['"!"'] * 50_000) + "]\n", "more than 32 parts"),
         ("x = { " + " . ".join(["a" * 150] * 9_000) + " = 1 }\n", "more than 32 parts"),
         ("".join(f"[cam{number}]\nsize = [640, 480]\n" for number in range(2_000)), "2000 cameras, at most 1024"),
-        (f"{_LENS}fps = 0x{'F' * 5000}\n", "a number too large"),
+        (f"{_LENS}fps = 0x{'F' * 5000}\n", ":3: a number too large"),
         ("#" * 5_000_000, "more than 4194304 bytes"),
     ],
     ids=["dotted", "quoted", "inline", "cameras", "digits", "size"],

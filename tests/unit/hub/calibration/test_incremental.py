@@ -161,6 +161,23 @@ def test_a_moved_camera_is_found_again_where_it_stands(shift_m: float, turn_rad:
     assert abs(float(before.reference_from_camera(at)) - float(after.reference_from_camera(at))) < 3e-3
 
 
+@pytest.mark.parametrize("seed", [4, 10])
+def test_a_move_of_one_of_two_cameras_is_not_adjusted_away(seed: int) -> None:
+    """With residuals of 9 and 7 px for 0.7 px before, the path followed both cameras."""
+    session = simulate(seed, 2, 40, windows=[(0, 40)] * 2)
+    last = update_calibration(session.rig, until(session, 20.0), None).calibration
+    lens, pose = session.rig.cameras["cam1"].intrinsics, session.poses["cam1"]
+    assert lens is not None
+    turned = replace(pose, rotation=so3.exp(np.array([0.0, 0.09, 0.0])) @ pose.rotation)
+    true = np.array([session.true_time(c, t) for c, t in zip(session.camera, session.time, strict=True)])
+    rows = (np.array(session.camera) == "cam1") & (true > 20.0)
+    path, pixels = session.paths["marker"].at(true[rows]), session.pixels.copy()
+    pixels[rows] += lens.project(turned.camera_from_world(path)) - lens.project(pose.camera_from_world(path))
+    with pytest.raises(Refused) as refusal:
+        update_calibration(session.rig, until(replace(session, pixels=pixels), 40.0), last, full=False)
+    assert "cam1" in refusal.value.cameras
+
+
 def test_cameras_that_see_nothing_any_more_stay_as_they_were() -> None:
     session = simulate(3, 4, 40)
     last = update_calibration(session.rig, until(session, 30.0), None).calibration

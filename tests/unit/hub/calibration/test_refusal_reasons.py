@@ -18,6 +18,8 @@ from hub.sync.pair_solver import _PairSearch, solve_pair
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from protocols.core.errors import Refused
+from protocols.geometry import so3
+from protocols.session.calibration import FixedCalibration
 from tests.support import rigs
 from tests.unit.hub.sync.test_acceptance import REFUSAL_KINDS, REJECTED
 
@@ -235,6 +237,42 @@ def test_every_kind_of_refusal_has_a_scenario() -> None:
     assert not [
         reason for reason in REFUSAL_KINDS if not any(reason in kind for kind in (*KINDS, *REJECTED, TWO_ALIKE))
     ]
+
+
+def test_a_camera_that_was_turned_since_is_left_out_of_a_known_calibration() -> None:
+    """A pair of it was solved, and it was placed with residuals of 37 px."""
+    session = rigs.simulate(4, 4, 20.0, late=0.5)
+    cameras = dict(calibrate(session.rig, session.observations()).cameras)
+    pose = cameras["cam2"].pose
+    turned = replace(cameras["cam2"], pose=replace(pose, rotation=so3.exp(np.array([0.0, 0.03, 0.0])) @ pose.rotation))
+    cameras["cam2"] = turned
+    found = calibrate(session.rig, session.observations(), known=FixedCalibration(cameras, "arbitrary"))
+    assert set(found.cameras) == {"cam0", "cam1", "cam3"}
+    assert "fit the trajectory seen by the other cameras" in found.refused["cam2"]
+    assert list(triangulate(session.rig, cameras, session.observations()).unused) == ["cam2"]
+
+
+def test_of_three_cameras_one_lens_or_their_geometry_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = rigs.simulate(3, 3, 15.0, late=0.5)
+    camera = session.rig.cameras["cam2"]
+    assert camera.intrinsics is not None
+    matrix = camera.intrinsics.matrix.copy()
+    matrix[:2, :2] *= 0.5
+    wide = replace(camera, intrinsics=replace(camera.intrinsics, matrix=matrix))
+    rig = replace(session.rig, cameras=session.rig.cameras | {"cam2": wide})
+    assert "cam2" in calibrate(rig, session.observations()).cameras
+    monkeypatch.setattr(calibrating, "_WRONG_GEOMETRY", 0.2)
+    texts = refusal_texts(replace(session, rig=rig))
+    assert "its measured lens is refuted" in texts
+    assert "their geometry may be what is wrong" in texts
+
+
+def test_through_narrow_lenses_the_adjustment_goes_on_until_it_has_converged() -> None:
+    """It ended 12° off, where each short step along a flat valley gained little."""
+    path = rigs.random_path(np.random.default_rng(1), extent=0.25)
+    session = rigs.simulate(1, 3, 15.0, noise=2.0, late=0.5, path=path)
+    found = calibrate(session.rig, session.observations())
+    assert session.turn_error({name: camera.pose for name, camera in found.cameras.items()}) < np.deg2rad(4.0)
 
 
 def test_where_pairs_were_solved_their_cameras_reasons_are_given() -> None:
