@@ -413,7 +413,7 @@ def _uncertain_depths(tables: Iterable[TrajectoryTable], state: AdjustmentState)
         distances = [np.linalg.norm(table.position[some] - one.pose.position, axis=1) for one in state.cameras]
         share = float(np.median(table.std[some] / np.min(distances, axis=0))) if len(table.std) else 0.0
         if share > _MAX_DEPTH_STD:
-            text = "of its distance (std): errors are larger than that tells; move the cameras apart"
+            text = "of its distance (std), which errors exceed: move the cameras apart"
             out.append(f"{table.label}: its path is known to {share:.0%} {text}")
     return tuple(out)
 
