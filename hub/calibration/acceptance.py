@@ -16,7 +16,7 @@ from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens
 from hub.calibration.self_calibration import MAX_FOCAL_STD
 from hub.sync.hypothesis import PairSolution
-from protocols.core.acceptance import AcceptanceTest, first_failure
+from protocols.core.acceptance import AcceptanceTest, PrecisionTest, first_failure
 from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration
 
@@ -189,7 +189,7 @@ def _focal_lengths(reconstruction: Reconstruction, found: cov.Covariance) -> Cam
     name, source = "std of the focal length", "measured: python -m tests.bench.lenses"
     return {
         camera: [
-            AcceptanceTest(
+            PrecisionTest(
                 name,
                 float(std),
                 MAX_FOCAL_STD,
@@ -211,7 +211,7 @@ def _precision(reconstruction: Reconstruction, found: cov.Covariance) -> CameraT
     only = "the common motion determines its"
     return {
         name: [
-            AcceptanceTest(
+            PrecisionTest(
                 "std of the orientation",
                 float(rotation),
                 _MAX_ROTATION_STD,
@@ -219,7 +219,7 @@ def _precision(reconstruction: Reconstruction, found: cov.Covariance) -> CameraT
                 "measured: python -m tests.bench.simulated_rigs",
                 f"{only} orientation only to {np.rad2deg(rotation):.1f}° (std)",
             ),
-            AcceptanceTest(
+            PrecisionTest(
                 "std of the clock at mid-overlap",
                 float(clock),
                 _MAX_CLOCK_STD,

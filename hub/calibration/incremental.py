@@ -47,6 +47,7 @@ from hub.clocks.step_correction import (
     with_step_stds,
 )
 from hub.sync.hypothesis import PairSolution, evidence
+from protocols.core.acceptance import PrecisionTest
 from protocols.core.clocks import CameraTime, TimeMap
 from protocols.core.errors import Refused
 from protocols.session.calibration import Calibration
@@ -276,7 +277,7 @@ def _adjust_without_failures(
             return reconstruction, reasons, refuted
         worst, reason = failure[0], failure[1].reason
         reasons[worst] = reason
-        if not failure[1].name.startswith("std of"):  # of which the rows say too little
+        if not isinstance(failure[1], PrecisionTest):
             refuted.add(worst)
         remaining = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
         del remaining[worst]

@@ -38,6 +38,11 @@ class AcceptanceTest:
         return large / max(small, 1e-300)
 
 
+@dataclass(frozen=True, slots=True)
+class PrecisionTest(AcceptanceTest):
+    """Of a std: where it fails, the observations do not refute the estimate, but say too little."""
+
+
 def first_failure(tests: Iterable[AcceptanceTest]) -> AcceptanceTest | None:
     """The first test that fails; None if all pass."""
     return next((test for test in tests if not test.passed), None)
