@@ -41,8 +41,7 @@ _MAX_PNP_POINTS = 400  # evenly spread: bounds the time of RANSAC
 _PNP_THRESHOLD_PX = 8.0  # generous: the first trajectory is rough
 _MIN_PNP_POINTS = 12  # twice the six unknowns of a pose
 _MIN_KNOT_SPACING, _MAX_KNOT_SPACING = 0.05, 0.3  # s
-_FEW_FRAMES_PER_KNOT = 4.5
-"""Frames a knot of a track's choice up to which the path's knots are twice as dense."""
+_FEW_FRAMES_PER_KNOT = 4.5  # of a track's choice, up to which the path's knots are twice as dense
 _MAX_INITIAL_ROWS, _MIN_ROWS_PER_KNOT = 5_000, 2.0  # of more rows, early adjustments use a share
 _SMALL_NETWORK, _ADJUST_GROWTH = 6, 1.33  # cameras; growth
 _TRIANGULATION_STEP = 0.05  # s between triangulated points
