@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from hub.bundle import initialisation
-from hub.bundle.initialisation import _subsampled
+from hub.bundle.initialisation import CameraInput, _subsampled, knot_spacing
 from hub.calibration.pipeline import calibrate
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
+from protocols.geometry.camera import Intrinsics
 from tests.support.rigs import simulate
 from tests.unit.hub.bundle.test_adjustment import simulated_problem
 
@@ -75,3 +77,14 @@ def test_a_sample_in_one_place_does_not_end_a_resection(monkeypatch: pytest.Monk
     session = simulate(3, 4, 20.0)
     assert len(calibrate(session.rig, session.observations()).cameras) == 4
     assert refused
+
+
+@pytest.mark.parametrize(("fps", "share"), [(12.0, 0.5), (60.0, 1.0)])
+def test_a_path_of_few_frames_a_knot_has_denser_knots(fps: float, share: float) -> None:
+    """Its cameras together see more of the motion than the frames of one, which limit that camera's own track."""
+    time = np.arange(0.0, 20.0, 1.0 / fps)
+    moved = np.column_stack([0.3 * np.sin(3.0 * time), 0.2 * np.sin(6.0 * time)])
+    track = smooth_track(time, moved + np.random.default_rng(1).normal(0.0, 2e-3, moved.shape), 1000.0)
+    assert isinstance(track, SmoothTrack)
+    lens = Intrinsics(1000, 1000, np.array([[1000.0, 0.0, 500.0], [0.0, 1000.0, 500.0], [0.0, 0.0, 1.0]]))
+    assert knot_spacing([CameraInput("a", lens, {"joint": track})], "joint") == share * track.basis.spacing
