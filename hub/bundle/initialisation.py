@@ -41,7 +41,7 @@ _MAX_PNP_POINTS = 400  # evenly spread: bounds the time of RANSAC
 _PNP_THRESHOLD_PX = 8.0  # generous: the first trajectory is rough
 _MIN_PNP_POINTS = 12  # twice the six unknowns of a pose
 _MIN_KNOT_SPACING, _MAX_KNOT_SPACING = 0.05, 0.3  # s
-_FEW_FRAMES_PER_KNOT = 4.5  # of a track's choice, up to which the path's knots are twice as dense
+_FEW_FRAMES_PER_KNOT, _MANY_ROWS = 4.5, 3.0  # of a track's choice; of all cameras, to each of twice as many knots
 _MAX_INITIAL_ROWS, _MIN_ROWS_PER_KNOT = 5_000, 2.0  # of more rows, early adjustments use a share
 _SMALL_NETWORK, _ADJUST_GROWTH = 6, 1.33  # cameras; growth
 _TRIANGULATION_STEP = 0.05  # s between triangulated points
@@ -269,17 +269,18 @@ def _subsampled(problem: Problem, state: AdjustmentState) -> Problem:
 
 
 def knot_spacing(cameras: list[CameraInput], label: str) -> float:
-    """Knot spacing [s] of a label's trajectory: the finest by the tracks' cross-validation, half of it with few frames.
+    """Knot spacing [s] of a label's trajectory: the finest by the tracks' cross-validation, or half of it.
 
-    There the frames, and not the motion, limit what a track follows; the path has those of other cameras too. What it
+    Of few frames a knot these, not the motion, limit what a track follows; the path has other cameras' too. What it
     does not follow all joints of a body do alike, which biases clocks: those of two walkers at 10 to 15 frames a second
     by up to 5000 ppm, also at true poses; by 500 with half. With six frames and more, as of drones, nothing is gained.
     """
-    spacings = []
-    for track in (camera.tracks[label] for camera in cameras if label in camera.tracks):
-        few = track.basis.spacing < _FEW_FRAMES_PER_KNOT * float(np.median(np.diff(track.time)))
-        spacings.append((0.5 if few else 1.0) * track.basis.spacing)
-    return float(np.clip(min(spacings), _MIN_KNOT_SPACING, _MAX_KNOT_SPACING))
+    tracks = [camera.tracks[label] for camera in cameras if label in camera.tracks]
+    rates = [1.0 / float(np.median(np.diff(track.time))) for track in tracks]
+    spacing, rate = min((track.basis.spacing, rate) for track, rate in zip(tracks, rates, strict=True))
+    if spacing * rate < _FEW_FRAMES_PER_KNOT and 0.5 * spacing * sum(rates) > _MANY_ROWS:
+        spacing *= 0.5
+    return float(np.clip(spacing, _MIN_KNOT_SPACING, _MAX_KNOT_SPACING))
 
 
 def triangulate_label(

@@ -87,4 +87,6 @@ def test_a_path_of_few_frames_a_knot_has_denser_knots(fps: float, share: float) 
     track = smooth_track(time, moved + np.random.default_rng(1).normal(0.0, 2e-3, moved.shape), 1000.0)
     assert isinstance(track, SmoothTrack)
     lens = Intrinsics(1000, 1000, np.array([[1000.0, 0.0, 500.0], [0.0, 1000.0, 500.0], [0.0, 0.0, 1.0]]))
-    assert knot_spacing([CameraInput("a", lens, {"joint": track})], "joint") == share * track.basis.spacing
+    cameras = [CameraInput(name, lens, {"joint": track}) for name in "abcd"]
+    assert knot_spacing(cameras, "joint") == share * track.basis.spacing
+    assert knot_spacing(cameras[:2], "joint") == track.basis.spacing  # two have too few rows for so many knots
