@@ -75,7 +75,7 @@ def likely_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[ClockS
     linear, trials = LinearisedModel.of(problem, state, state.sigma * np.sqrt(np.median(inflation))), []
     needed = needed_for_a_step(problem)
     for camera in range(len(state.cameras)):
-        used = [part.time[part.use] for part in problem.rows if part.camera == camera]
+        used = [part.time[part.use] for part in problem.of_camera(camera)]
         times = np.unique(np.concatenate([np.zeros(0), *used]))
         if len(times) >= 2 * _MIN_STEP_FRAMES:
             first = max(0.05 * len(times), _MIN_STEP_FRAMES)
@@ -99,7 +99,7 @@ def _step_of_rejected_rows(problem: Problem, state: AdjustmentState) -> ClockSte
     """
     found: list[ClockStep] = []
     for camera in range(len(state.cameras)):
-        parts = [part for part in problem.rows if part.camera == camera]
+        parts = problem.of_camera(camera)
         if sum(int(np.count_nonzero(~part.use)) for part in parts) < _MIN_STEP_FRAMES:
             continue
         times = np.concatenate([part.time for part in parts])
@@ -133,7 +133,7 @@ def best_split(times: Floats, costs: Floats) -> tuple[float, float, float, float
 def _last_in_few_rows(problem: Problem, state: AdjustmentState) -> bool:
     """Whether errors last in a camera with too few rows for a precise estimate of that."""
     for camera in range(len(state.cameras)):
-        few = sum(np.count_nonzero(part.use) for part in problem.rows if part.camera == camera) < _FEW_ROWS
+        few = sum(np.count_nonzero(part.use) for part in problem.of_camera(camera)) < _FEW_ROWS
         if few and score_inflation(problem, state, camera, _FEW_PAIRS) > _FEW_INFLATION:
             return True
     return False
@@ -178,7 +178,7 @@ def _with_its_noise(
         inflation = np.maximum(inflation, modelled)
     sigma = state.sigma * residual_std(left, corrected) / residual_std(problem, state) * np.sqrt(inflation)
     step, _, _ = LinearisedModel.of(problem, state, sigma).best_step(camera, times)
-    effective = 2.0 * sum(int(part.use.sum()) for part in problem.rows if part.camera == camera) / inflation[camera]
+    effective = 2.0 * sum(int(part.use.sum()) for part in problem.of_camera(camera)) / inflation[camera]
     return replace(step, statistic=float(effective * np.log1p(step.statistic / effective)))
 
 

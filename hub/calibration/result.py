@@ -318,7 +318,7 @@ def _rejected_rows(names: list[str], problem: Problem, state: AdjustmentState) -
     """One sentence for each camera many of whose rows were left out, though others saw the point then."""
     out = []
     for number, name in enumerate(names):
-        parts = [part for part in problem.rows if part.camera == number]
+        parts = problem.of_camera(number)
         norms = [residual_norms(part, state.cameras[number], state.trajectories[part.label]) for part in parts]
         seen = sum(int(np.isfinite(norm).sum()) for norm in norms)
         left = sum(int((np.isfinite(norm) & ~part.use).sum()) for norm, part in zip(norms, parts, strict=True))
@@ -432,7 +432,7 @@ def _with_correction_errors(std: float, problem: Problem, state: AdjustmentState
     variance = std**2 + sum(one.std**2 for one in state.wanders if one.camera in (camera, reference))
     for step in state.clock_steps:
         if step.camera in (camera, reference):  # its size moves the map by the share of the rows beyond it
-            rows = [rows.time[rows.use] for rows in problem.rows if rows.camera == step.camera]
+            rows = [rows.time[rows.use] for rows in problem.of_camera(step.camera)]
             after = float(np.mean(np.concatenate(rows) >= step.time))
             variance += (step.std * (after if step.time > state.cameras[step.camera].centre else 1.0 - after)) ** 2
     return float(np.sqrt(variance))
@@ -441,8 +441,7 @@ def _with_correction_errors(std: float, problem: Problem, state: AdjustmentState
 def _rms(problem: Problem, state: AdjustmentState, camera: int) -> float:
     parts = [
         residual_norms(rows, state.cameras[camera], state.trajectories[rows.label])[rows.use]
-        for rows in problem.rows
-        if rows.camera == camera
+        for rows in problem.of_camera(camera)
     ]
     norms = np.concatenate(parts) if parts else np.zeros(0)
     norms = norms[np.isfinite(norms)]
@@ -453,12 +452,11 @@ def _residual_rows(
     problem: Problem, state: AdjustmentState, camera: int, time_origin: float, time_scale: float
 ) -> Floats:
     parts = []
-    for rows in problem.rows:
-        if rows.camera == camera:
-            predicted = predict(rows, state.cameras[camera], state.trajectories[rows.label])
-            good = rows.use & np.isfinite(predicted).all(axis=1)
-            stamps = rows.stamps[good] / time_scale + time_origin
-            parts.append(np.column_stack([stamps, rows.pixels[good], (rows.pixels - predicted)[good]]))
+    for rows in problem.of_camera(camera):
+        predicted = predict(rows, state.cameras[camera], state.trajectories[rows.label])
+        good = rows.use & np.isfinite(predicted).all(axis=1)
+        stamps = rows.stamps[good] / time_scale + time_origin
+        parts.append(np.column_stack([stamps, rows.pixels[good], (rows.pixels - predicted)[good]]))
     return np.concatenate(parts) if parts else np.zeros((0, 5))
 
 
