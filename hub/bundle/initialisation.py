@@ -229,7 +229,7 @@ def triangulate_and_adjust(
             used.append(label)
     new_label = {label: i for i, label in enumerate(used)}
     used_rows = tuple(
-        replace(part, camera=numbers[name], label=new_label[part.label])
+        part.renumbered(numbers[name], new_label[part.label])
         for name in names
         for part in rows[name]
         if part.label in new_label

@@ -105,6 +105,12 @@ class TrackObservations:
         """Relative stds of the rows in use."""
         return np.ones(int(np.count_nonzero(self.use))) if self.relative_std is None else self.relative_std[self.use]
 
+    def renumbered(self, camera: int, label: int) -> TrackObservations:
+        """The same rows with other indices, in half of the time of `replace`: networks grow camera by camera."""
+        return TrackObservations(
+            camera, label, self.time, self.pixels, self.use, self.stamp, self.relative_std, self.along_std
+        )
+
     def using(self, use: Bools) -> TrackObservations:
         """The same rows with another inlier mask."""
         return replace(self, use=use)

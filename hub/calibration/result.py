@@ -409,7 +409,7 @@ def _uncertain_depths(tables: Iterable[TrajectoryTable], state: AdjustmentState)
     """One sentence for each path whose depth is known so badly that its errors are not as its stds say."""
     out = list[str]()
     for table in tables:
-        some = slice(None, None, 1 + len(table.std) // 1000)
+        some = slice(None, None, 1 + len(table.std) // 100)
         distances = [np.linalg.norm(table.position[some] - one.pose.position, axis=1) for one in state.cameras]
         share = float(np.median(table.std[some] / np.min(distances, axis=0))) if len(table.std) else 0.0
         if share > _MAX_DEPTH_STD:
