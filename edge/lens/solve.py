@@ -6,6 +6,7 @@ The estimate is accepted only where the views could reveal an error: they must c
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,8 +75,8 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
         if outlier.any() and (~outlier).sum() >= MIN_VIEWS:  # blurred, or with mismatched corners
             accepted = [view for view, out in zip(accepted, outlier, strict=True) if not out]
             fit = _calibrate(accepted, size, fisheye, few)
-    except cv2.error as error:
-        reason = " ".join(str(error.err).split())
+    except (cv2.error, np.linalg.LinAlgError) as error:
+        reason = " ".join(str(getattr(error, "err", error)).split())
         raise Refused(f"no camera model fits these views ({reason}): tilt the board in different directions") from None
     intrinsics, std, view_rms = fit
     rms = float(np.sqrt(np.mean(view_rms**2)))
@@ -121,11 +122,8 @@ def _pinhole(views: list[BoardView], size: tuple[int, int], few: bool) -> tuple[
     pixels = [view.pixels.astype(np.float32)[:, None] for view in views]
     start = intrinsics_from_field_of_view(size, 65.0, False).matrix
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | (_FEW_FLAGS if few else 0)
-    _, matrix, distortions, *poses = cv2.calibrateCamera(points, pixels, size, start, np.zeros(5), flags=flags)
-    found = Intrinsics(
-        size[0], size[1], np.array(matrix, dtype=np.float64), np.array(distortions, dtype=np.float64).ravel()[:5]
-    )
-    return found, *_quality(views, found, poses, few)
+    _, *fit = cv2.calibrateCamera(points, pixels, size, start, np.zeros(5), flags=flags)
+    return _with_quality(views, size, fit, False, few)
 
 
 def _fisheye(views: list[BoardView], size: tuple[int, int]) -> tuple[Intrinsics, float, Floats]:
@@ -136,51 +134,52 @@ def _fisheye(views: list[BoardView], size: tuple[int, int]) -> tuple[Intrinsics,
     place: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2
     flags = place.CALIB_RECOMPUTE_EXTRINSIC | place.CALIB_FIX_SKEW | place.CALIB_USE_INTRINSIC_GUESS
     fits: list[Any] = []
-    for degrees in (180.0, 120.0):
+    for degrees in (120.0, 180.0):
         start = intrinsics_from_field_of_view(size, degrees, True).matrix
-        try:
+        with suppress(cv2.error):  # an assertion, where a view has no pose
             fits.append(cv2.fisheye.calibrate(points, pixels, size, start, np.zeros((4, 1)), flags=flags))
-        except cv2.error:
-            if degrees == 120.0 and not fits:
-                raise
-    _, matrix, distortions, *poses = min(fits, key=lambda fit: float(np.nan_to_num(fit[0], nan=np.inf)))
-    found = Intrinsics(
-        size[0], size[1], np.array(matrix, dtype=np.float64), np.array(distortions, dtype=np.float64).ravel(), True
-    )
-    return found, *_quality(views, found, poses, False)
+    if not fits:
+        raise Refused("no fisheye fits these views: tilt the board in different directions")
+    _, *fit = min(fits, key=lambda fit: float(np.nan_to_num(fit[0], nan=np.inf)))
+    return _with_quality(views, size, fit, True, False)
 
 
-def _quality(views: list[BoardView], lens: Intrinsics, poses: list[Any], few: bool) -> tuple[float, Floats]:
-    """The relative std of the focal length, and the rms [px] of each view. poses: rotation vectors, translations.
+def _with_quality(
+    views: list[BoardView], size: tuple[int, int], fit: list[Any], fisheye: bool, few: bool
+) -> tuple[Intrinsics, float, Floats]:
+    """The lens, the relative std of its focal length, the rms [px] of each view. fit: matrix, distortions, poses.
 
     From the normal equations with each view's pose eliminated. OpenCV's own stds are of a pseudo-inverse: a focal
     length that no view determines, all of them face on, has next to none there. few: what the estimate owes to the
     principal point that it took for granted (consider covariance).
     """
+    matrix, distortions = np.array(fit[0], dtype=np.float64), np.array(fit[1], dtype=np.float64).ravel()
+    lens = Intrinsics(*size, matrix, distortions[: 4 if fisheye else 5], fisheye)
     count = 4 + len(lens.distortions)
-    information, view_rms = np.zeros((count, count)), []
-    for view, rotation, translation in zip(views, *poses, strict=True):
+    information, residuals = np.zeros((count, count)), []
+    for view, rotation, translation in zip(views, *fit[2:], strict=True):
         at = np.ravel(rotation), np.ravel(translation), lens.matrix, lens.distortions
-        if lens.fisheye:
+        if fisheye:
             seen, jacobian = cv2.fisheye.projectPoints(view.points[None], *at)
             a, b = jacobian[:, :8], jacobian[:, 8:14]  # intrinsics; the view's pose
         else:
             seen, jacobian = cv2.projectPoints(view.points, *at)
             a, b = jacobian[:, 6:15], jacobian[:, :6]
         information += a.T @ a - a.T @ b @ np.linalg.pinv(b) @ a
-        view_rms.append(float(np.sqrt(((np.reshape(seen, (-1, 2)) - view.pixels) ** 2).sum(axis=1).mean())))
-    rows = 2 * sum(len(view.points) for view in views)
-    square = 0.5 * float(np.array([2 * len(view.points) for view in views]) @ np.square(view_rms))
+        residuals.append(np.ravel(seen) - view.pixels.ravel())
+    every = np.concatenate(residuals)
     # The columns of what is estimated, and of what was held at a value with a std.
-    free = np.eye(count)[:, [1, 4, 5]] + np.outer(np.eye(count)[0], [1, 0, 0]) if few else np.eye(count)
-    held = np.eye(count)[:, 2:4] * _PRINCIPAL_POINT_STD * max(lens.width, lens.height) if few else np.zeros((count, 0))
+    unit = np.eye(count)
+    free = np.column_stack([unit[0] + unit[1], unit[4], unit[5]]) if few else unit
+    held = unit[:, 2:4] * (_PRINCIPAL_POINT_STD * max(size) if few else 0.0)
     normal = free.T @ information @ free
     scale = np.sqrt(np.maximum(normal.diagonal(), 1e-12))
     inverse = np.linalg.inv(normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))) / np.outer(scale, scale)
-    moved = inverse @ free.T @ information @ held
-    freedom = max(rows - len(scale) - 6 * len(views), 1)
-    variance = square / freedom * inverse.diagonal() + (moved**2).sum(axis=1)
-    return float(np.sqrt(variance[: 1 if few else 2].max())) / lens.focal, np.array(view_rms)
+    freedom = max(len(every) - len(scale) - 6 * len(views), 1)
+    variance = every @ every / freedom * inverse.diagonal()
+    variance += np.square(inverse @ free.T @ information @ held).sum(axis=1)
+    view_rms = np.array([np.sqrt(2.0 * np.mean(one**2)) for one in residuals])
+    return lens, float(np.sqrt(variance[: 1 if few else 2].max())) / lens.focal, view_rms
 
 
 def _corner_counts(views: list[BoardView], size: tuple[int, int]) -> Ints:
