@@ -39,7 +39,7 @@ from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
-from protocols.session.rig import MAX_READOUT_S, Rig
+from protocols.session.rig import Rig, longest_readout
 
 _SHORT_GAPS, _MAX_NOMINAL = 0.05, 4.0
 """Quantile of a camera's gaps between rows that stands for consecutive frames, and how much faster than those its
@@ -332,8 +332,8 @@ def _rejected_rows(names: list[str], problem: Problem, state: AdjustmentState) -
 
 def _readout(rig: Rig, name: str, found: float) -> float:
     """Readout time [s] from the first row to the last: as given, else as estimated; 0 if neither."""
-    given = rig.cameras[name].readout
-    return float(np.clip(found, -MAX_READOUT_S, MAX_READOUT_S)) if given is None else given
+    given, longest = rig.cameras[name].readout, longest_readout(rig.cameras[name].fps)
+    return float(np.clip(found, -longest, longest)) if given is None else given
 
 
 def _estimated_readouts(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
