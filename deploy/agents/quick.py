@@ -33,6 +33,7 @@ WINDOW_S = 600.0  # of observations: longer than any run of `quick` waves a mark
 _TARGET_OFFSET_STD_S = 0.0005  # clock offset std of every camera at which the calibration is sufficient
 _ADVICE_INTERVAL_S = 3.0  # shortest time between two lines of advice
 _MIN_CONSECUTIVE_GOOD = 3  # sufficient calibrations in a row before it ends
+_HUB_START_S = 10.0  # s: longest wait for the hub to subscribe, before cameras are started
 
 
 class LastFrameDevice(WrappedDevice):
@@ -105,7 +106,7 @@ class QuickCalibration:
         rig = settings.rig
         self.hub = LiveHub(LiveSettings(WINDOW_S, 2.0), rig, solver=WorkerSolver())
         self._errors: list[BaseException] = []
-        self._reset_requested = threading.Event()
+        self._reset_requested, self._hub_listens = threading.Event(), threading.Event()
         self._consecutive_good = 0
         self._revision = -1
         self._reported, self._reported_at = "", 0.0
@@ -122,8 +123,9 @@ class QuickCalibration:
 
         Raises InputError if a camera does not respond.
         """
-        cameras = [self._thread(f"camera {name}", self._run_camera, name) for name in self._devices]
         hub = self._thread("hub", self._run_hub)
+        self._hub_listens.wait(_HUB_START_S)  # a short film would be over before
+        cameras = [self._thread(f"camera {name}", self._run_camera, name) for name in self._devices]
         started = time.monotonic()
         try:
             if self.settings.target is not None:
@@ -182,9 +184,10 @@ class QuickCalibration:
 
     def _run_hub(self) -> None:
         with MemoryBus(self._network) as bus:
-            run_hub(self.hub, bus, "hub", self._stop_hub, rig=self.settings.rig, beat=self._reset_if_requested)
+            run_hub(self.hub, bus, "hub", self._stop_hub, rig=self.settings.rig, beat=self._beat)
 
-    def _reset_if_requested(self) -> None:
+    def _beat(self) -> None:
+        self._hub_listens.set()
         if self._reset_requested.is_set():
             self._reset_requested.clear()
             self.hub.reset()

@@ -6,6 +6,7 @@ The estimate is accepted only where the views could reveal an error: they must c
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,7 @@ _MAX_FOCAL_STD = 0.004  # relative
 _PRINCIPAL_POINT_STD = 0.012  # of the larger image side, of usual cameras about the middle
 _FEW_FLAGS = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
 _OUTLIER_RATIO = 2.5  # times the median view's rms
+_RIDGE = 1e-12  # relative, of normal equations: of what no view determines a std follows that is refused
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,8 +75,8 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
         if outlier.any() and (~outlier).sum() >= MIN_VIEWS:  # blurred, or with mismatched corners
             accepted = [view for view, out in zip(accepted, outlier, strict=True) if not out]
             fit = _calibrate(accepted, size, fisheye, few)
-    except cv2.error as error:
-        reason = " ".join(str(error.err).split())
+    except (cv2.error, np.linalg.LinAlgError) as error:
+        reason = " ".join(str(getattr(error, "err", error)).split())
         raise Refused(f"no camera model fits these views ({reason}): tilt the board in different directions") from None
     intrinsics, std, view_rms = fit
     rms = float(np.sqrt(np.mean(view_rms**2)))
@@ -119,46 +121,65 @@ def _pinhole(views: list[BoardView], size: tuple[int, int], few: bool) -> tuple[
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32)[:, None] for view in views]
     start = intrinsics_from_field_of_view(size, 65.0, False).matrix
-    _, matrix, distortions, _, _, stds, _, view_rms = cv2.calibrateCameraExtended(
-        points, pixels, size, start, np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS | (_FEW_FLAGS if few else 0)
-    )
-    found: Floats = np.asarray(matrix, dtype=np.float64)
-    intrinsics = Intrinsics(size[0], size[1], found, np.asarray(distortions, dtype=np.float64).ravel()[:5])
-    std = float(np.asarray(stds).ravel()[:2].max() / intrinsics.focal)
-    if few:  # what was assumed of the principal point is uncertain too, and goes into the focal length
-        std = float(np.hypot(std, _PRINCIPAL_POINT_STD))
-    return intrinsics, std, np.asarray(view_rms, dtype=np.float64).ravel()
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | (_FEW_FLAGS if few else 0)
+    _, *fit = cv2.calibrateCamera(points, pixels, size, start, np.zeros(5), flags=flags)
+    return _with_quality(views, size, fit, False, few)
 
 
 def _fisheye(views: list[BoardView], size: tuple[int, int]) -> tuple[Intrinsics, float, Floats]:
+    """From two fields of view to start from, of which OpenCV needs one near the lens's: 120 ends at 140, 180 begins."""
     points = [view.points[None] for view in views]
     pixels = [view.pixels[None] for view in views]
-    start = intrinsics_from_field_of_view(size, 120.0, True).matrix
     # OpenCV 4 keeps these flags in cv2.fisheye, with other values than OpenCV 5's.
     place: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2
     flags = place.CALIB_RECOMPUTE_EXTRINSIC | place.CALIB_FIX_SKEW | place.CALIB_USE_INTRINSIC_GUESS
-    _, matrix, distortions, rotations, translations = cv2.fisheye.calibrate(
-        points, pixels, size, start, np.zeros((4, 1)), flags=flags
-    )
-    found: Floats = np.asarray(matrix, dtype=np.float64)
-    distortions = np.asarray(distortions, dtype=np.float64).ravel()
-    # OpenCV gives no std here: it is taken from the normal equations with each view's pose eliminated.
-    information = np.zeros((8, 8))
-    square, view_rms = 0.0, []
-    for view, rotation, translation in zip(views, rotations, translations, strict=True):
-        seen, jacobian = cv2.fisheye.projectPoints(
-            view.points[None], np.asarray(rotation), np.asarray(translation), found, distortions
-        )
-        residual = np.asarray(seen).reshape(-1, 2) - view.pixels
-        a, b = np.asarray(jacobian)[:, :8], np.asarray(jacobian)[:, 8:14]  # intrinsics; the view's pose
-        information += a.T @ a - a.T @ b @ np.linalg.solve(b.T @ b, b.T @ a)
-        view_rms.append(float(np.sqrt((residual**2).sum(axis=1).mean())))
-        square += float((residual**2).sum())
-    degrees_of_freedom = 2 * sum(len(view.points) for view in views) - 8 - 6 * len(views)
-    covariance = np.linalg.pinv(information) * square / max(degrees_of_freedom, 1)
-    calibrated = Intrinsics(size[0], size[1], found, distortions, True)
-    std = float(np.sqrt(np.diag(covariance)[:2].max())) / calibrated.focal
-    return calibrated, std, np.array(view_rms)
+    fits: list[Any] = []
+    for degrees in (120.0, 180.0):
+        start = intrinsics_from_field_of_view(size, degrees, True).matrix
+        with suppress(cv2.error):  # an assertion, where a view has no pose
+            fits.append(cv2.fisheye.calibrate(points, pixels, size, start, np.zeros((4, 1)), flags=flags))
+    if not fits:
+        raise Refused("no fisheye fits these views: tilt the board in different directions")
+    _, *fit = min(fits, key=lambda fit: float(np.nan_to_num(fit[0], nan=np.inf)))
+    return _with_quality(views, size, fit, True, False)
+
+
+def _with_quality(
+    views: list[BoardView], size: tuple[int, int], fit: list[Any], fisheye: bool, few: bool
+) -> tuple[Intrinsics, float, Floats]:
+    """The lens, the relative std of its focal length, the rms [px] of each view. fit: matrix, distortions, poses.
+
+    From the normal equations with each view's pose eliminated. OpenCV's own stds are of a pseudo-inverse: a focal
+    length that no view determines, all of them face on, has next to none there. few: what the estimate owes to the
+    principal point that it took for granted (consider covariance).
+    """
+    matrix, distortions = np.array(fit[0], dtype=np.float64), np.array(fit[1], dtype=np.float64).ravel()
+    lens = Intrinsics(*size, matrix, distortions[: 4 if fisheye else 5], fisheye)
+    count = 4 + len(lens.distortions)
+    information, residuals = np.zeros((count, count)), []
+    for view, rotation, translation in zip(views, *fit[2:], strict=True):
+        at = np.ravel(rotation), np.ravel(translation), lens.matrix, lens.distortions
+        if fisheye:
+            seen, jacobian = cv2.fisheye.projectPoints(view.points[None], *at)
+            a, b = jacobian[:, :8], jacobian[:, 8:14]  # intrinsics; the view's pose
+        else:
+            seen, jacobian = cv2.projectPoints(view.points, *at)
+            a, b = jacobian[:, 6:15], jacobian[:, :6]
+        information += a.T @ a - a.T @ b @ np.linalg.pinv(b) @ a
+        residuals.append(np.ravel(seen) - view.pixels.ravel())
+    every = np.concatenate(residuals)
+    # The columns of what is estimated, and of what was held at a value with a std.
+    unit = np.eye(count)
+    free = np.column_stack([unit[0] + unit[1], unit[4], unit[5]]) if few else unit
+    held = unit[:, 2:4] * (_PRINCIPAL_POINT_STD * max(size) if few else 0.0)
+    normal = free.T @ information @ free
+    scale = np.sqrt(np.maximum(normal.diagonal(), 1e-12))
+    inverse = np.linalg.inv(normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))) / np.outer(scale, scale)
+    freedom = max(len(every) - len(scale) - 6 * len(views), 1)
+    variance = every @ every / freedom * inverse.diagonal()
+    variance += np.square(inverse @ free.T @ information @ held).sum(axis=1)
+    view_rms = np.array([np.sqrt(2.0 * np.mean(one**2)) for one in residuals])
+    return lens, float(np.sqrt(variance[: 1 if few else 2].max())) / lens.focal, view_rms
 
 
 def _corner_counts(views: list[BoardView], size: tuple[int, int]) -> Ints:

@@ -115,7 +115,7 @@ def _reject_single_views(parts: list[TrackObservations], state: AdjustmentState)
 def gauge(problem: Problem, state: AdjustmentState) -> Floats:
     """Orthonormal directions (7, p) in which the free camera parameters do not move: the pose of the first anchor and
     the distance between the two anchors. (0, p) where poses are not free."""
-    columns = problem.free_columns()
+    columns = problem.free_columns
     if not problem.free_parameters.pose:
         return np.zeros((0, len(columns)))
     first, second = problem.anchors
@@ -131,7 +131,7 @@ def gauge(problem: Problem, state: AdjustmentState) -> Floats:
 def apply_step(problem: Problem, state: AdjustmentState, path_step: Floats, camera_step: Floats) -> AdjustmentState:
     """The state after a step of the free parameters."""
     full = np.zeros(len(state.cameras) * CAMERA_PARAMETERS)
-    full[problem.free_columns()] = camera_step
+    full[problem.free_columns] = camera_step
     cameras = tuple(
         apply_camera_step(camera, full[i * CAMERA_PARAMETERS : (i + 1) * CAMERA_PARAMETERS])
         for i, camera in enumerate(state.cameras)

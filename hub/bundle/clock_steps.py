@@ -5,6 +5,7 @@ Score tests of a `LinearisedModel`, as those of `model_comparison`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -16,7 +17,7 @@ from hub.bundle.noise.correlated_noise import MIN_INFLATION
 from hub.bundle.noise.gauss_markov import estimate_correlated_noise
 from hub.bundle.noise.noise_scale import correlation_inflation, modelled_inflation, residual_std, score_inflation
 from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
-from hub.bundle.problem import OFFSET, AdjustmentState, ClockStep, Problem
+from hub.bundle.problem import OFFSET, AdjustmentState, ClockStep, Problem, TrackObservations
 from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians, residual_norms
 from protocols.geometry.types import Floats
 
@@ -30,6 +31,8 @@ STEP_SIZES = np.linspace(-MAX_STEP_S, MAX_STEP_S, 81)
 """Sizes [s] of a step that are tried where it is not linear: refined by the adjustment."""
 _REJECTED_SIGMA, _REJECTED_PX, _MIN_EXPLAINED = 5.0, 20.0, 0.5
 """Residual, in sigma and px, from which a row counts as not explained; share of the cost that a step has to remove."""
+_FIRST_ROWS = 500
+"""Rows of a camera in which half of that share is looked for first."""
 _MIN_SIGMA_SHARE = 1.0 / 3.0
 """Of the cameras' median: noise that a camera has at least where a clock step is looked for."""
 _FEW_ROWS, _FEW_PAIRS, _FEW_INFLATION = 300, 50, 2.5
@@ -75,7 +78,7 @@ def likely_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[ClockS
     linear, trials = LinearisedModel.of(problem, state, state.sigma * np.sqrt(np.median(inflation))), []
     needed = needed_for_a_step(problem)
     for camera in range(len(state.cameras)):
-        used = [part.time[part.use] for part in problem.rows if part.camera == camera]
+        used = [part.time[part.use] for part in problem.of_camera(camera)]
         times = np.unique(np.concatenate([np.zeros(0), *used]))
         if len(times) >= 2 * _MIN_STEP_FRAMES:
             first = max(0.05 * len(times), _MIN_STEP_FRAMES)
@@ -99,22 +102,30 @@ def _step_of_rejected_rows(problem: Problem, state: AdjustmentState) -> ClockSte
     """
     found: list[ClockStep] = []
     for camera in range(len(state.cameras)):
-        parts = [part for part in problem.rows if part.camera == camera]
+        parts = problem.of_camera(camera)
         if sum(int(np.count_nonzero(~part.use)) for part in parts) < _MIN_STEP_FRAMES:
             continue
-        times = np.concatenate([part.time for part in parts])
-        order, most = np.argsort(times, kind="stable"), max(_REJECTED_PX, _REJECTED_SIGMA * float(state.sigma[camera]))
-        costs = []
-        for size in STEP_SIZES:
-            moved = (replace(part, time=part.time - size) for part in parts)
-            norms = [residual_norms(part, state.cameras[camera], state.trajectories[part.label]) for part in moved]
-            costs.append(np.fmin(np.concatenate(norms), most)[order] ** 2)
-        time, before, after, cost = best_split(times[order], np.array(costs))
-        whole = float(costs[len(costs) // 2].sum())
-        if cost < (1.0 - _MIN_EXPLAINED) * whole:
-            statistic = _REJECTED_SIGMA**2 * (whole - cost) / most**2
-            found.append(ClockStep(camera, time, after - before, np.inf, statistic))
+        every = 1 + sum(len(part.time) for part in parts) // _FIRST_ROWS
+        if _best_shift([part.every(every) for part in parts], state)[1] > _MIN_EXPLAINED / 2.0:
+            step, explained = _best_shift(parts, state)
+            found += [step] if explained > _MIN_EXPLAINED else []
     return max(found, key=lambda one: one.statistic, default=None)
+
+
+def _best_shift(parts: Sequence[TrackObservations], state: AdjustmentState) -> tuple[ClockStep, float]:
+    """The step of one camera's clock that explains most of what its rows cost, all else fixed, and the share."""
+    number = parts[0].camera
+    camera, most = state.cameras[number], max(_REJECTED_PX, _REJECTED_SIGMA * float(state.sigma[number]))
+    times = np.concatenate([part.time for part in parts])
+    order, costs = np.argsort(times, kind="stable"), []
+    for size in STEP_SIZES:
+        moved = (replace(part, time=part.time - size) for part in parts)
+        norms = [residual_norms(part, camera, state.trajectories[part.label]) for part in moved]
+        costs.append(np.fmin(np.concatenate(norms), most)[order] ** 2)
+    time, before, after, cost = best_split(times[order], np.array(costs))
+    gained = float(costs[len(costs) // 2].sum()) - cost
+    step = ClockStep(number, time, after - before, np.inf, _REJECTED_SIGMA**2 * gained / most**2)
+    return step, gained / max(gained + cost, 1e-12)
 
 
 def best_split(times: Floats, costs: Floats) -> tuple[float, float, float, float]:
@@ -133,7 +144,7 @@ def best_split(times: Floats, costs: Floats) -> tuple[float, float, float, float
 def _last_in_few_rows(problem: Problem, state: AdjustmentState) -> bool:
     """Whether errors last in a camera with too few rows for a precise estimate of that."""
     for camera in range(len(state.cameras)):
-        few = sum(np.count_nonzero(part.use) for part in problem.rows if part.camera == camera) < _FEW_ROWS
+        few = sum(np.count_nonzero(part.use) for part in problem.of_camera(camera)) < _FEW_ROWS
         if few and score_inflation(problem, state, camera, _FEW_PAIRS) > _FEW_INFLATION:
             return True
     return False
@@ -178,7 +189,7 @@ def _with_its_noise(
         inflation = np.maximum(inflation, modelled)
     sigma = state.sigma * residual_std(left, corrected) / residual_std(problem, state) * np.sqrt(inflation)
     step, _, _ = LinearisedModel.of(problem, state, sigma).best_step(camera, times)
-    effective = 2.0 * sum(int(part.use.sum()) for part in problem.rows if part.camera == camera) / inflation[camera]
+    effective = 2.0 * sum(int(part.use.sum()) for part in problem.of_camera(camera)) / inflation[camera]
     return replace(step, statistic=float(effective * np.log1p(step.statistic / effective)))
 
 

@@ -96,7 +96,7 @@ def covariance(
     `gauge_constraints`.
     """
     parts, blocks = eliminate_paths(problem, state, prior)
-    columns = problem.free_columns()
+    columns = problem.free_columns
     information = parts.reduced
     constraints = np.zeros((0, len(columns)))
     if problem.free_parameters.pose:

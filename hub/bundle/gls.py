@@ -227,7 +227,7 @@ def _step(
 ) -> tuple[Floats, Floats, ParameterCovariance, bool]:
     """Steps of the paths (3 n,) and the free camera parameters (p,), the covariance (p, p) of these, and whether the
     state is off the constraints."""
-    columns = problem.free_columns()
+    columns = problem.free_columns
     first_columns = np.r_[0, np.cumsum([3 * path.basis.size for path in state.trajectories])]
     motion = [smoothness_terms(path, *prior.of(label)) for label, path in enumerate(state.trajectories)]
     paths, first_knot = int(first_columns[-1]), int(first_columns[-1])

@@ -230,7 +230,7 @@ def triangulate_and_adjust(
             used.append(label)
     new_label = {label: i for i, label in enumerate(used)}
     used_rows = tuple(
-        replace(part, camera=numbers[name], label=new_label[part.label])
+        part.renumbered(numbers[name], new_label[part.label])
         for name in names
         for part in rows[name]
         if part.label in new_label
@@ -399,8 +399,8 @@ def _resection_points(
 def observation_times(problem: Problem, state: AdjustmentState, label: int, but: int | None = None) -> list[Floats]:
     """Sorted internal times at which a label is observed, by camera that observes it, one camera left out."""
     seen: dict[int, list[Floats]] = {}
-    for rows in problem.rows:
-        if rows.label == label and rows.camera != but and rows.use.any():
+    for rows in problem.of_label(label):
+        if rows.camera != but and rows.use.any():
             seen.setdefault(rows.camera, []).append(rows.time[rows.use])
     return [np.sort(state.cameras[number].reference_time(np.concatenate(seen[number]))) for number in sorted(seen)]
 

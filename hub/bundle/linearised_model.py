@@ -105,8 +105,8 @@ class LinearisedModel:
                 state = minimise(problem, self.state, self.prior, False, _STEPS_ALONE, _TOLERANCE, [], False)
                 costs.append(weigh_residuals(problem, state, self.prior, robust=False).cost)
             return costs[0] - costs[1]
-        own = free[self.problem.free_columns()[free] // CAMERA_PARAMETERS == camera]
-        problem = replace(self.problem, rows=tuple(part for part in self.problem.rows if part.camera == camera))
+        own = free[self.problem.free_columns[free] // CAMERA_PARAMETERS == camera]
+        problem = replace(self.problem, rows=self.problem.of_camera(camera))
         state, damping, still = self.state, _FIRST_DAMPING, np.zeros_like(self.path)
         residuals = weigh_residuals(problem, state, self.prior, robust=False)
         first, system = residuals.cost, None
@@ -127,15 +127,15 @@ class LinearisedModel:
 
     def readouts(self) -> dict[int, Ints]:
         """The column (1,) of each camera's readout that was not given."""
-        columns = self.problem.free_columns()
+        columns = self.problem.free_columns
         free = np.flatnonzero(columns % CAMERA_PARAMETERS == READOUT)
         return {int(columns[k]) // CAMERA_PARAMETERS: np.array([k]) for k in free}
 
     def best_step(self, camera: int, times: Floats) -> tuple[ClockStep, Floats, Floats]:
         """The best of a camera's steps at camera times (k,); what the paths (m,) and the cameras (p,) do with it."""
-        state, system, columns = self.state, self.system, self.problem.free_columns()
+        state, system, columns = self.state, self.system, self.problem.free_columns
         seen = evaluate_labels(
-            [part for part in self.problem.rows if part.camera == camera],
+            self.problem.of_camera(camera),
             state.cameras[camera],
             StackedTrajectories.of(state.trajectories),
         )

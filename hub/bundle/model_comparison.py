@@ -89,12 +89,12 @@ def _refuted_lenses(
     problem: Problem, linear: LinearisedModel, given: list[int], tested: tuple[int, ...]
 ) -> list[ScoreTest]:
     """Those of the cameras ``given`` by one set of parameters. linear: with all lenses free."""
-    columns, count = linear.problem.free_columns(), len(problem.nominal)
+    columns, count = linear.problem.free_columns, len(problem.nominal)
     own = {camera: camera * CAMERA_PARAMETERS + np.array(tested) for camera in given}
 
     def with_lenses(chosen: Iterable[int]) -> Ints:
         """The columns of all other parameters and of these lenses."""
-        wanted = np.concatenate([problem.free_columns(), *(own[camera] for camera in chosen)])
+        wanted = np.concatenate([problem.free_columns, *(own[camera] for camera in chosen)])
         return np.flatnonzero(np.isin(columns, wanted))
 
     @cache
@@ -172,7 +172,7 @@ def with_crystal_rates(problem: Problem, state: AdjustmentState) -> Problem:
     wide = replace(problem, crystal_rates=())
     noisy = replace(state, sigma=state.sigma * np.sqrt(correlation_inflation(problem, state)))
     covariance = LinearisedModel.about(wide, noisy, estimate_smoothness(problem, state)).covariance
-    variance = dict(zip(wide.free_columns().tolist(), covariance.diagonal().tolist(), strict=True))
+    variance = dict(zip(wide.free_columns.tolist(), covariance.diagonal().tolist(), strict=True))
     reference = state.cameras[problem.clock_reference].rate
     crystal = tuple(
         (camera.rate - reference) ** 2

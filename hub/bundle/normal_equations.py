@@ -24,7 +24,6 @@ from hub.bundle.problem import (
     AdjustmentState,
     LensPrior,
     Problem,
-    TrackObservations,
 )
 from hub.bundle.residuals import ResidualEvaluation, StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, smoothness_cost, smoothness_terms
@@ -53,12 +52,9 @@ def weigh_residuals(
     cost += sum((value / std) ** 2 for _, value, std in camera_priors(problem, state))
     # A point behind the camera or off the path costs as much as a gross outlier, and has no gradient.
     gross_error_cost = CAUCHY_WIDTH**2 * np.log1p((100.0 / CAUCHY_WIDTH) ** 2) if robust else 100.0**2
-    by_camera: dict[int, list[TrackObservations]] = {}
-    for rows in problem.rows:
-        by_camera.setdefault(rows.camera, []).append(rows)
     paths = StackedTrajectories.of(state.trajectories)
     evaluations, weights = [], []
-    for camera, parts in by_camera.items():
+    for camera, parts in problem.by_camera.items():
         residuals = evaluate_labels(parts, state.cameras[camera], paths)
         information = residuals.relative_information / state.sigma[camera] ** 2
         squared = np.square(residuals.whitened(residuals.residual)).sum(axis=0) * information
@@ -71,7 +67,7 @@ def weigh_residuals(
             losses = squared
         cost += float(np.where(residuals.valid, losses, gross_error_cost).sum())
         evaluations.append(residuals)
-    return WeightedResiduals(tuple(by_camera), tuple(evaluations), tuple(weights), float(cost))
+    return WeightedResiduals(tuple(problem.by_camera), tuple(evaluations), tuple(weights), float(cost))
 
 
 def build_system(
@@ -87,7 +83,7 @@ def assemble(
 ) -> BorderedSystem:
     """The normal equations at a state whose rows are ``residuals``."""
     first_rows = np.r_[0, np.cumsum([3 * path.basis.size for path in state.trajectories])].astype(int)
-    columns = problem.free_columns()
+    columns = problem.free_columns
     corner, gradient_cameras = list[tuple[Ints, Floats]](), np.zeros(len(columns))
     band, gradient_path = np.zeros((BAND, first_rows[-1])), np.zeros(first_rows[-1])
     blocks = [PathBlocks(path.basis.size) for path in state.trajectories]
@@ -138,7 +134,7 @@ def prior_terms(problem: Problem, state: AdjustmentState) -> tuple[BlockSum, Flo
     for column, value, std in camera_priors(problem, state):
         information[column] += 1.0 / std**2
         gradient[column] += value / std**2
-    columns = problem.free_columns()
+    columns = problem.free_columns
     return BlockSum(information[columns]), gradient[columns]
 
 

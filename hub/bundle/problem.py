@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -102,6 +104,12 @@ class TrackObservations:
     def used_relative_std(self) -> Floats:
         """Relative stds of the rows in use."""
         return np.ones(int(np.count_nonzero(self.use))) if self.relative_std is None else self.relative_std[self.use]
+
+    def renumbered(self, camera: int, label: int) -> TrackObservations:
+        """The same rows with other indices, in half of the time of `replace`: networks grow camera by camera."""
+        return TrackObservations(
+            camera, label, self.time, self.pixels, self.use, self.stamp, self.relative_std, self.along_std
+        )
 
     def using(self, use: Bools) -> TrackObservations:
         """The same rows with another inlier mask."""
@@ -214,7 +222,7 @@ class FreeParameters:
     rate_std: float = 1e-3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Problem:
     """Observations and fixed quantities of a bundle adjustment.
 
@@ -237,6 +245,24 @@ class Problem:
     lens_tolerances: tuple[LensPrior, ...] = ()
     crystal_rates: tuple[bool, ...] = ()
 
+    @cached_property
+    def by_camera(self) -> dict[int, tuple[TrackObservations, ...]]:
+        """The observations of each camera that has any, in the order of the rows."""
+        return _grouped(self.rows, lambda rows: rows.camera)
+
+    @cached_property
+    def by_label(self) -> dict[int, tuple[TrackObservations, ...]]:
+        """The observations of each label that has any, in the order of the rows."""
+        return _grouped(self.rows, lambda rows: rows.label)
+
+    def of_camera(self, camera: int) -> tuple[TrackObservations, ...]:
+        """The observations by one camera."""
+        return self.by_camera.get(camera, ())
+
+    def of_label(self, label: int) -> tuple[TrackObservations, ...]:
+        """The observations of one label."""
+        return self.by_label.get(label, ())
+
     def rate_std(self, camera: int) -> float:
         """Prior std of a camera's rate about 1."""
         crystal = bool(self.crystal_rates) and self.crystal_rates[camera]
@@ -248,7 +274,7 @@ class Problem:
 
     def longest_readout(self, camera: int) -> float:
         """A sensor is read before its next frame [s]."""
-        steps = [np.diff(np.unique(part.stamps)) for part in self.rows if part.camera == camera]
+        steps = [np.diff(np.unique(part.stamps)) for part in self.of_camera(camera)]
         return min([MAX_READOUT_S, *(float(np.median(step)) for step in steps if len(step))])
 
     def lens_prior(self, camera: int) -> LensPrior | None:
@@ -259,6 +285,7 @@ class Problem:
             return replace(tolerance, focal_std=tolerance.focal_std if prior is None else prior.focal_std)
         return prior
 
+    @cached_property
     def free_columns(self) -> Ints:
         """Indices of the free camera parameters in the stacked vector of CAMERA_PARAMETERS each."""
         columns: list[int] = []
@@ -275,4 +302,15 @@ class Problem:
                 columns.append(base + READOUT)
             if prior is not None and not prior.focal_only:
                 columns += range(base + CENTRE, base + (P1 if self.nominal[camera].fisheye else CAMERA_PARAMETERS))
-        return np.array(columns, dtype=np.int64)
+        found = np.array(columns, dtype=np.int64)
+        found.flags.writeable = False
+        return found
+
+
+def _grouped(
+    rows: tuple[TrackObservations, ...], key: Callable[[TrackObservations], int]
+) -> dict[int, tuple[TrackObservations, ...]]:
+    groups: dict[int, list[TrackObservations]] = {}
+    for part in rows:
+        groups.setdefault(key(part), []).append(part)
+    return {value: tuple(parts) for value, parts in groups.items()}

@@ -61,10 +61,9 @@ def estimate_smoothness(problem: Problem, state: AdjustmentState, weak: bool = F
         count = len(path.basis.interval_starts())
         differences = third_differences(path.basis, path.control)
         seen = np.zeros((len(state.cameras), size), dtype=np.bool_)
-        for rows in problem.rows:
-            if rows.label == label:
-                index, _, inside = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[rows.use]))[:3]
-                seen[rows.camera, index[inside]] = True
+        for rows in problem.of_label(label):
+            index, _, inside = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[rows.use]))[:3]
+            seen[rows.camera, index[inside]] = True
         starts = path.basis.interval_starts()
         seen_by_two = seen.sum(axis=0)[starts] >= 2
         held = _held(seen_by_two, starts)

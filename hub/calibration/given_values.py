@@ -51,14 +51,14 @@ def sensitivities(
     parameter i or a focal length, whose weight is 1 / std², and -C N[:, f] std for a focal length f that was held. Of
     three axes, the worst one. References without std have no error to speak of, and unknown lenses are not given.
     """
-    free, base = problem.free_parameters, problem.free_columns()
+    free, base = problem.free_parameters, problem.free_columns
     if not free.pose:
         return [() for _ in names]
     lenses: dict[int, Floats] = {}
     held = [i for i in range(len(names)) if problem.lens_prior(i) is None and not free.lens]
     if held:
         freed = replace(problem, free_parameters=replace(free, lens=True))
-        normal, columns = eliminate_paths(freed, state, prior)[0].reduced, freed.free_columns()
+        normal, columns = eliminate_paths(freed, state, prior)[0].reduced, freed.free_columns
         focal = normal.columns(np.searchsorted(columns, np.array(held) * CAMERA_PARAMETERS + FOCAL))
         changes = -found.spread(found.free @ focal[np.searchsorted(columns, base)])
         lenses = dict(zip(held, changes.T, strict=True))

@@ -39,7 +39,7 @@ from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
-from protocols.session.rig import MAX_READOUT_S, Rig
+from protocols.session.rig import Rig, longest_readout
 
 _SHORT_GAPS, _MAX_NOMINAL = 0.05, 4.0
 """Quantile of a camera's gaps between rows that stands for consecutive frames, and how much faster than those its
@@ -318,7 +318,7 @@ def _rejected_rows(names: list[str], problem: Problem, state: AdjustmentState) -
     """One sentence for each camera many of whose rows were left out, though others saw the point then."""
     out = []
     for number, name in enumerate(names):
-        parts = [part for part in problem.rows if part.camera == number]
+        parts = problem.of_camera(number)
         norms = [residual_norms(part, state.cameras[number], state.trajectories[part.label]) for part in parts]
         seen = sum(int(np.isfinite(norm).sum()) for norm in norms)
         left = sum(int((np.isfinite(norm) & ~part.use).sum()) for norm, part in zip(norms, parts, strict=True))
@@ -332,8 +332,8 @@ def _rejected_rows(names: list[str], problem: Problem, state: AdjustmentState) -
 
 def _readout(rig: Rig, name: str, found: float) -> float:
     """Readout time [s] from the first row to the last: as given, else as estimated; 0 if neither."""
-    given = rig.cameras[name].readout
-    return float(np.clip(found, -MAX_READOUT_S, MAX_READOUT_S)) if given is None else given
+    given, longest = rig.cameras[name].readout, longest_readout(rig.cameras[name].fps)
+    return float(np.clip(found, -longest, longest)) if given is None else given
 
 
 def _estimated_readouts(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
@@ -409,7 +409,7 @@ def _uncertain_depths(tables: Iterable[TrajectoryTable], state: AdjustmentState)
     """One sentence for each path whose depth is known so badly that its errors are not as its stds say."""
     out = list[str]()
     for table in tables:
-        some = slice(None, None, 1 + len(table.std) // 1000)
+        some = slice(None, None, 1 + len(table.std) // 100)
         distances = [np.linalg.norm(table.position[some] - one.pose.position, axis=1) for one in state.cameras]
         share = float(np.median(table.std[some] / np.min(distances, axis=0))) if len(table.std) else 0.0
         if share > _MAX_DEPTH_STD:
@@ -432,7 +432,7 @@ def _with_correction_errors(std: float, problem: Problem, state: AdjustmentState
     variance = std**2 + sum(one.std**2 for one in state.wanders if one.camera in (camera, reference))
     for step in state.clock_steps:
         if step.camera in (camera, reference):  # its size moves the map by the share of the rows beyond it
-            rows = [rows.time[rows.use] for rows in problem.rows if rows.camera == step.camera]
+            rows = [rows.time[rows.use] for rows in problem.of_camera(step.camera)]
             after = float(np.mean(np.concatenate(rows) >= step.time))
             variance += (step.std * (after if step.time > state.cameras[step.camera].centre else 1.0 - after)) ** 2
     return float(np.sqrt(variance))
@@ -441,8 +441,7 @@ def _with_correction_errors(std: float, problem: Problem, state: AdjustmentState
 def _rms(problem: Problem, state: AdjustmentState, camera: int) -> float:
     parts = [
         residual_norms(rows, state.cameras[camera], state.trajectories[rows.label])[rows.use]
-        for rows in problem.rows
-        if rows.camera == camera
+        for rows in problem.of_camera(camera)
     ]
     norms = np.concatenate(parts) if parts else np.zeros(0)
     norms = norms[np.isfinite(norms)]
@@ -453,12 +452,11 @@ def _residual_rows(
     problem: Problem, state: AdjustmentState, camera: int, time_origin: float, time_scale: float
 ) -> Floats:
     parts = []
-    for rows in problem.rows:
-        if rows.camera == camera:
-            predicted = predict(rows, state.cameras[camera], state.trajectories[rows.label])
-            good = rows.use & np.isfinite(predicted).all(axis=1)
-            stamps = rows.stamps[good] / time_scale + time_origin
-            parts.append(np.column_stack([stamps, rows.pixels[good], (rows.pixels - predicted)[good]]))
+    for rows in problem.of_camera(camera):
+        predicted = predict(rows, state.cameras[camera], state.trajectories[rows.label])
+        good = rows.use & np.isfinite(predicted).all(axis=1)
+        stamps = rows.stamps[good] / time_scale + time_origin
+        parts.append(np.column_stack([stamps, rows.pixels[good], (rows.pixels - predicted)[good]]))
     return np.concatenate(parts) if parts else np.zeros((0, 5))
 
 

@@ -116,7 +116,9 @@ def read_kalibr(file: Path) -> ForeignRig:
     body: list[tuple[Floats, Floats] | None] = []
     lenses: dict[str, Intrinsics] = {}
     own: dict[str, TimeMap | None] = {}
-    for key, table in values.items():
+    # The chain goes by the number; in Kalibr's files cam10 follows cam1.
+    for key in sorted(values, key=lambda key: int(key[3:]) if re.fullmatch(r"cam\d+", key) else -1):
+        table = values[key]
         if not isinstance(table, dict) or "intrinsics" not in table:
             continue
         name = check_name(str(table.get("name", key)), file=file, line=_line(text, key))

@@ -337,6 +337,11 @@ def _read_ball_outline(table: _Table) -> bool:
     return value
 
 
+def longest_readout(fps: float) -> float:
+    """The longest readout [s] that a rig.toml may hold: a sensor is read before its next frame. fps: 0 = unknown."""
+    return min(MAX_READOUT_S, _MAX_READOUT_INTERVALS / fps) if fps > 0.0 else MAX_READOUT_S
+
+
 def _read_readout(table: _Table, fps: float) -> float | None:
     value = table.values.get("readout")
     if value is None:
@@ -344,7 +349,7 @@ def _read_readout(table: _Table, fps: float) -> float | None:
     if not isinstance(value, int | float) or isinstance(value, bool) or not -MAX_READOUT_S <= value <= MAX_READOUT_S:
         remedy = "give the seconds from the image's first row to its last, as 0.02; below 0 if the last is read first"
         raise table.fail("readout", f"readout = {value!r}", remedy)
-    if fps > 0.0 and abs(value) > _MAX_READOUT_INTERVALS / fps:
+    if abs(value) > longest_readout(fps):
         longer = f"readout = {value!r} is longer than the {1e3 / fps:.3g} ms between two frames at fps = {fps:g}"
         raise table.fail("readout", longer, "a sensor is read before its next frame: correct one of the two")
     return float(value)

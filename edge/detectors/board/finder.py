@@ -127,7 +127,7 @@ class Finder:
             # The sector-based finder's corners are biased by up to 0.03 px, which unknown lenses take up.
             _, refined = self.refine(grey, (numbers, np.asarray(corners, dtype=np.float64).reshape(-1, 2)))
             pixels = refined.reshape(inner[1], inner[0], 2)
-            if _is_regular(pixels):
+            if _is_regular(pixels) and not any(_goes_on(grey, np.rot90(pixels, turn)) for turn in range(4)):
                 return numbers, _ordered(grey, pixels).reshape(-1, 2)
         return NOTHING
 
@@ -210,6 +210,21 @@ def _ends(grey: Grey, lines: Floats) -> bool:
     light = max(levels[1][::2].mean(), levels[1][1::2].mean()) - 0.25 * abs(inner)
     is_margin = abs(margin) < 0.25 * abs(inner) and levels[2].mean() > light
     return bool(is_margin and -last * np.sign(inner) > 0.5 * abs(inner))
+
+
+def _goes_on(grey: Grey, lines: Floats) -> bool:
+    """Whether another row of squares follows the first of lines (n, m, 2) of corners: part of a larger board.
+
+    Which part is another one from frame to frame. Of the row next to the last squares every square then has the level
+    of the square two steps further in; a margin has that of every second one.
+    """
+    step, middle = lines[0] - lines[1], 0.5 * (lines[0, :-1] + lines[0, 1:])
+    inner, after = (np.rint(middle + far * 0.5 * (step[:-1] + step[1:])).astype(int) for far in (-0.5, 1.5))
+    if ((after < 0) | (after >= grey.shape[::-1])).any():
+        return False
+    levels, beyond = (grey[one[:, 1], one[:, 0]].astype(np.float64) for one in (inner, after))
+    contrast = abs(levels[::2].mean() - levels[1::2].mean())
+    return bool((np.abs(beyond - levels) < 0.5 * contrast).all())
 
 
 def _right_handed(corners: Floats) -> Floats:

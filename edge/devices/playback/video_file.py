@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import cv2
@@ -29,8 +30,9 @@ def check_recording(path: Path) -> None:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The images in a folder, by name. Raises InputError if there are none."""
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    """The images in a folder, by name, numbers by value (2.png before 10.png). Raises InputError if there are none."""
+    files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    files.sort(key=lambda file: ([int(x) if x.isdecimal() else x for x in re.split(r"(\d+)", file.name)], file.name))
     if not files:
         kinds = ", ".join(sorted(IMAGE_SUFFIXES))
         raise InputError("no images in this folder", file=folder, remedy=f"put {kinds} files in it")

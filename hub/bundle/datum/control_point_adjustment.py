@@ -44,7 +44,7 @@ def adjust_to_control_points(
             return with_exact_poses(rig, names, found)
         except np.linalg.LinAlgError:
             pass  # the noise model does not suit these rows: independent noise does
-    columns = problem.free_columns()
+    columns = problem.free_columns
     system, seen = build_system(problem, state, prior, robust=False)
     now = terms(state)
     for _ in range(_MAX_ITERATIONS):

@@ -113,7 +113,7 @@ def _with_nominal_lenses(problem: Problem, state: AdjustmentState) -> Adjustment
 
 def _largest_rotation_std(problem: Problem, best: GlsSolution) -> float:
     """Largest over the cameras of the smallest relative rotation std [rad] to any other camera."""
-    covariance = CameraCovariance(problem.free_columns(), len(best.state.cameras), best.free)
+    covariance = CameraCovariance(problem.free_columns, len(best.state.cameras), best.free)
     stds = relative_rotation_stds(covariance, best.state)
     np.fill_diagonal(stds, np.inf)
     return float(stds.min(axis=1).max())
@@ -125,7 +125,7 @@ def prefers_nominal_lenses(problem: Problem, best: GlsSolution) -> bool:
     problem: with lens tolerances. The Bayes factor is the Savage-Dickey density ratio: prior over posterior density at
     zero lens offset, both taken as Gaussian.
     """
-    columns = problem.free_columns()
+    columns = problem.free_columns
     terms = {
         column: (value, std)
         for column, value, std in camera_priors(problem, best.state)

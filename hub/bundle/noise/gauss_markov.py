@@ -110,8 +110,8 @@ def fit_maximum_likelihood(parts: list[tuple[Floats, Floats]]) -> tuple[float, f
 def _residuals(problem: Problem, state: AdjustmentState, camera: int) -> list[tuple[Floats, Floats]]:
     """Times (n,) and residuals (n, 2) of each label's used rows, in order of time."""
     out = []
-    for rows in problem.rows:
-        if rows.camera != camera or np.count_nonzero(rows.use) < 8:
+    for rows in problem.of_camera(camera):
+        if np.count_nonzero(rows.use) < 8:
             continue
         residual = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
         good = np.isfinite(residual).all(axis=1)

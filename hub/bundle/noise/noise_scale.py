@@ -67,7 +67,7 @@ def estimate_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPr
         system.border,
         inverse_blocks(system.band),
     )
-    parameters = np.bincount(problem.free_columns() // CAMERA_PARAMETERS, minlength=len(noise)).astype(np.float64)
+    parameters = np.bincount(problem.free_columns // CAMERA_PARAMETERS, minlength=len(noise)).astype(np.float64)
     return _over_redundancy(noise, fixed, state, found, parameters, _MAX_ROWS_IN_ROUNDS)
 
 
@@ -89,9 +89,13 @@ def _over_redundancy(
 ) -> Floats:
     """Noise (cameras,) of residual stds, given how many coordinates of each camera are absorbed beside those found."""
     coordinates, absorbed = np.zeros(len(noise)), absorbed.copy()
-    for rows in problem.rows:
-        coordinates[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
-        absorbed[rows.camera] += _hat_matrix_trace(problem, state, found, rows, most_rows)
+    for label, parts in problem.by_label.items():
+        seeing = found.a_inv_b.parts[label][1]
+        known = found.free.submatrix(seeing) if len(found.columns) else np.zeros((0, 0))
+        for rows in parts:
+            coordinates[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
+            share = -(-most_rows // len(problem.of_camera(rows.camera)))
+            absorbed[rows.camera] += _hat_matrix_trace(problem, state, found, known, rows, share)
     degrees = np.maximum(coordinates - absorbed, 1.0)
     squares = np.square(noise) * np.maximum(coordinates, 1.0)
     common = float(squares.sum() / degrees.sum())
@@ -127,22 +131,29 @@ def _pooled_noise(problem: Problem, state: AdjustmentState) -> float:
     ratios = []
     for label, path in enumerate(state.trajectories):
         squares, rows_of = np.zeros(path.basis.size), np.zeros(path.basis.size)
-        for rows in problem.rows:
-            if rows.label == label:
-                norms = residual_norms(rows, state.cameras[rows.camera], path)
-                good = rows.use & np.isfinite(norms)
-                index = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[good]))[0]
-                squares += np.bincount(index, norms[good] ** 2, path.basis.size)
-                rows_of += np.bincount(index, minlength=path.basis.size)
+        for rows in problem.of_label(label):
+            norms = residual_norms(rows, state.cameras[rows.camera], path)
+            good = rows.use & np.isfinite(norms)
+            index = path.basis.locate(state.cameras[rows.camera].reference_time(rows.time[good]))[0]
+            squares += np.bincount(index, norms[good] ** 2, path.basis.size)
+            rows_of += np.bincount(index, minlength=path.basis.size)
         seen = rows_of >= 2
         ratios.append(squares[seen] / chdtri(2.0 * rows_of[seen] - 3.0, 0.5))
     return max(_MIN_SIGMA_PX, float(np.sqrt(np.median(np.concatenate(ratios)))))
 
 
 def _hat_matrix_trace(
-    problem: Problem, state: AdjustmentState, found: Covariance, rows: TrackObservations, most_rows: int = _MAX_ROWS
+    problem: Problem,
+    state: AdjustmentState,
+    found: Covariance,
+    known: Floats,
+    rows: TrackObservations,
+    most_rows: int,
 ) -> float:
-    """Trace of the hat matrix over the rows: how many of their residual coordinates the fit absorbs."""
+    """Trace of the hat matrix over the rows: how many of their residual coordinates the fit absorbs.
+
+    known: covariance of the parameters of the cameras that see the label.
+    """
     used = np.flatnonzero(rows.use)
     if not len(used):
         return 0.0
@@ -162,11 +173,11 @@ def _hat_matrix_trace(
     leverage = (by_path @ blocks * by_path).sum(axis=(1, 2))
     if columns:
         shift = -by_path @ by_cameras[3 * line.index[:, None] + np.arange(BAND)]
-        parameters = problem.free_columns()[seeing]
+        parameters = problem.free_columns[seeing]
         own = np.flatnonzero(parameters // CAMERA_PARAMETERS == rows.camera)
         shift[:, :, own] += root * line.camera_jacobian[:, :, parameters[own] % CAMERA_PARAMETERS]
         shift = shift.reshape(-1, len(seeing))
-        leverage += (shift @ found.free.submatrix(seeing) * shift).reshape(len(pick), -1).sum(axis=1)
+        leverage += (shift @ known * shift).reshape(len(pick), -1).sum(axis=1)
     # A coordinate has 1 at most; where a path passes through the camera's plane, rounding made it thousands.
     return float(np.minimum(leverage, 2.0).sum()) * len(used) / len(pick)
 
@@ -175,7 +186,7 @@ def modelled_inflation(problem: Problem, state: AdjustmentState, camera: int) ->
     """Rows per effective row (n / effective n) by the estimated noise model; 1 without one."""
     if state.correlated_noise is None:
         return 1.0
-    times = [np.unique(rows.time[rows.use]) for rows in problem.rows if rows.camera == camera]
+    times = [np.unique(rows.time[rows.use]) for rows in problem.of_camera(camera)]
     if not any(len(time) > 1 for time in times):
         return 1.0
     white, correlated = (
@@ -201,8 +212,8 @@ def correlation_inflation(problem: Problem, state: AdjustmentState) -> Floats:
 
 def _inflation_of(problem: Problem, state: AdjustmentState, camera: int) -> float:
     parts: list[tuple[Floats, Floats]] = []
-    for rows in problem.rows:
-        if rows.camera != camera or np.count_nonzero(rows.use) < 8:
+    for rows in problem.of_camera(camera):
+        if np.count_nonzero(rows.use) < 8:
             continue
         residual = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
         good = np.isfinite(residual).all(axis=1)
@@ -217,8 +228,8 @@ def score_inflation(problem: Problem, state: AdjustmentState, camera: int, min_p
     Where the motion turns from frame to frame, the residuals of a lasting time error do too, while these do not.
     """
     parts: list[tuple[Floats, Floats]] = []
-    for rows in problem.rows:
-        if rows.camera == camera and np.count_nonzero(rows.use) >= 8:
+    for rows in problem.of_camera(camera):
+        if np.count_nonzero(rows.use) >= 8:
             line = linearise(rows, state.cameras[camera], state.trajectories[rows.label], OFFSET + 1)
             score = (line.residual * line.camera_jacobian[:, :, OFFSET]).sum(axis=1)
             parts.append((rows.stamps[rows.use][line.valid], np.column_stack([score, score])[line.valid]))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import chdtri, fdtri
@@ -62,6 +63,15 @@ class _FrameRows:
     def sums(self, values: Floats) -> Floats:
         """Sums (m,) of values (n,) over the rows of each frame."""
         return np.asarray(np.bincount(self.frame, values, len(self.stamp)), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ObservedTimes:
+    """Internal times (n,) of one camera's rows in use, and the median interval between them [s]."""
+
+    camera: int
+    times: Floats
+    interval: float
 
 
 def estimate_frame_times(
@@ -174,9 +184,7 @@ def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: 
     stamped: the problem with the original timestamps.
     """
     stamps, heights, residuals, velocities = [np.zeros(0)], [np.zeros(0)], [np.zeros((0, 2))], [np.zeros((0, 2))]
-    for before, rows in zip(stamped.rows, current.rows, strict=True):
-        if rows.camera != camera:
-            continue
+    for before, rows in zip(stamped.of_camera(camera), current.of_camera(camera), strict=True):
         line, velocity = _velocity(rows, state)
         residual = line.residual - velocity * (rows.time - before.time)[:, None]
         across = np.abs(_transverse(residual, velocity)) / np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
@@ -197,16 +205,24 @@ def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: 
 def _is_path_held(problem: Problem, state: AdjustmentState, rows: TrackObservations) -> Bools:
     """Rows (n,) with rows of the same label by other cameras before and after them: beyond these its path is
     extrapolated, and all rows of such an end would be late or early together."""
-    others = [
-        state.cameras[part.camera].reference_time(part.time[part.use])
-        for part in problem.rows
-        if part.label == rows.label and part.camera != rows.camera
-    ]
-    known = np.sort(np.concatenate([[-np.inf, np.inf], *others]))
+    others = [one for one in _observed_times(problem, state)[rows.label] if one.camera != rows.camera]
+    known = np.sort(np.concatenate([[-np.inf, np.inf], *(one.times for one in others)]))
     time = state.cameras[rows.camera].reference_time(rows.time)
     after, before = known[np.searchsorted(known, time)], known[np.searchsorted(known, time, "right") - 1]
-    within = max(SEEN_WITHIN_S, *(float(np.median(np.diff(one))) for one in others if len(one) > 1), 0.0)
+    within = max([SEEN_WITHIN_S, *(one.interval for one in others)])
     return np.asarray(np.maximum(after - time, time - before) <= within)
+
+
+@lru_cache(maxsize=1)  # for each camera in turn
+def _observed_times(problem: Problem, state: AdjustmentState) -> dict[int, list[_ObservedTimes]]:
+    """When each label is seen, by camera."""
+    found: dict[int, list[_ObservedTimes]] = {}
+    for label, parts in problem.by_label.items():
+        for part in parts:
+            times = state.cameras[part.camera].reference_time(part.time[part.use])
+            interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+            found.setdefault(label, []).append(_ObservedTimes(part.camera, times, interval))
+    return found
 
 
 def _velocity(rows: TrackObservations, state: AdjustmentState) -> tuple[LinearisedResiduals, Floats]:

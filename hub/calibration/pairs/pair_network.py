@@ -90,14 +90,15 @@ def solve_pairs(
         if arrivals and len(names) > LARGE_NETWORK and synchronised.has_enough(a, b):
             pairs[a, b] = PairSolution(a, b, "not searched: both cameras are in enough solved pairs")
             continue
+        predicted_lag = None if prepared.shared_clock else synchronised.lag(prepared, a, b)
         expected = expected_lag(prepared, a, b, arrivals) if arrivals and not prepared.shared_clock else None
         if expected is not None:
             near = PairSettings(predicted_lag_window=expected[1])
             solution = _solve(prepared, (a, b), known, predicted_lag=expected[0], settings=near, cache=cache)
-            if not solution.solved:
+            if not solution.solved or _agrees(solution, predicted_lag):
                 pairs[a, b] = solution
+                synchronised.add(solution)
                 continue
-        predicted_lag = None if prepared.shared_clock else synchronised.lag(prepared, a, b)
         # A pair that was not searched completely is left as it is if by now others connect three cameras.
         is_done = (a, b) in pairs and max(synchronised.size(a), synchronised.size(b)) >= _MIN_REDUNDANT
         may_leave = thorough == "first pair" and predicted_lag is None
@@ -231,6 +232,13 @@ def expected_lag(
     # t_unix = t_a + m_a = t_b + m_b, with times from each camera's time origin
     difference = other.unix_minus_camera - one.unix_minus_camera
     return difference + prepared.time_origins[b] - prepared.time_origins[a], lag_window
+
+
+def _agrees(solution: PairSolution, predicted_lag: float | None) -> bool:
+    """Whether a solved pair's lag is one that a search about the predicted one would find."""
+    if solution.fit is None or predicted_lag is None:
+        return False
+    return abs(solution.fit.lag - predicted_lag) < PairSettings().predicted_lag_window
 
 
 def _has_long_overlap(solution: PairSolution) -> bool:

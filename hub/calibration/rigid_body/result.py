@@ -21,7 +21,7 @@ from protocols.core.version import VERSION
 from protocols.geometry.pose import Similarity
 from protocols.geometry.types import Floats, Ints
 from protocols.session.calibration import Calibration, CameraCalibration, FixedCalibration, TrajectoryTable
-from protocols.session.rig import Rig
+from protocols.session.rig import Rig, longest_readout
 
 _SEEN_WITHIN = 0.2  # s: a camera sees a point at a time if it has an observation this near
 _MAX_SAMPLES = 1_000_000  # of one path
@@ -63,6 +63,7 @@ def publish(rig: Rig, solution: BodySolution) -> Calibration:
     reference = names.index(requested) if requested in names else 0
     stds = solution.lens_stds()
     maps = [_time_map(problem, state, i, reference) for i in range(len(names))]
+    longest = {name: longest_readout(rig.cameras[name].fps) for name in names}
     cameras = {
         name: CameraCalibration(
             name=name,
@@ -75,7 +76,7 @@ def publish(rig: Rig, solution: BodySolution) -> Calibration:
             else solution.known.cameras[name].position_std,
             rms_px=_rms(problem, state, i),
             focal_std=stds[name][0] if name in stds else 0.0,
-            readout=state.cameras[i].readout,
+            readout=float(np.clip(state.cameras[i].readout, -longest[name], longest[name])),
             readout_std=covariance.std(i, READOUT),
             lag_time=state.cameras[i].centre + problem.views[i].time_origin,
             lag_std=_relative_std(covariance, i, reference, OFFSET),

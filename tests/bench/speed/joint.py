@@ -137,7 +137,7 @@ class Stacked:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        columns = task.problem.free_columns()
+        columns = task.problem.free_columns
         # What holds the gauge: the first camera, and the second one's place along the baseline, which is the x axis.
         first, second = (camera * CAMERA_PARAMETERS for camera in task.problem.anchors)
         held = np.r_[first : first + 6, second + 3]

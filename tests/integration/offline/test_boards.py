@@ -286,3 +286,15 @@ def test_a_chessboard_that_looks_the_same_upside_down_keeps_its_order_while_it_t
         back = cv2.transform(pixels[None].astype(np.float64), cv2.invertAffineTransform(turn))[0]
         first = back if first is None else first
         assert np.abs(back - first).max() < 1.0
+
+
+def test_a_part_of_a_larger_chessboard_is_not_the_board() -> None:
+    # Which part would be another one from frame to frame. 7x5: the inner corners, as some tools count.
+    lens = Intrinsics(640, 480, np.array([[520.0, 0.0, 319.5], [0.0, 520.0, 239.5], [0.0, 0.0, 1.0]]))
+    renderer, drawing = boards.BoardRenderer(lens, 1), boards.chessboard_image()
+    images = [renderer.draw(drawing, *pose)[..., 0].copy() for pose in boards.board_poses(8, 5, 0.5, 0.15)]
+    found = {}
+    for squares in ((8, 6), (7, 6), (8, 5), (7, 5)):
+        board = next(iter(Board("chessboard", squares, inverted=False, mirrored=False).prints()))
+        found[squares] = sum(len(Finder(board).find(image)[0]) > 0 for image in images)
+    assert found == {(8, 6): len(images), (7, 6): 0, (8, 5): 0, (7, 5): 0}

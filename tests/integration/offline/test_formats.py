@@ -266,6 +266,17 @@ def test_kalibrs_chain_takes_the_camera_before_into_this_one(tmp_path: Path) -> 
     np.testing.assert_array_equal(cameras["cam0"].intrinsics.distortions, [-0.2, 0.04, 1e-3, -7e-4, 0.0])
 
 
+def test_kalibrs_chain_goes_by_the_cameras_numbers(tmp_path: Path) -> None:
+    step = [[1.0, 0.0, 0.0, -1.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    cam = yaml.safe_load(CAMCHAIN)["cam0"]
+    chain = {f"cam{i}": {**cam, "T_cn_cnm1": step, "timeshift_cam_imu": 0.1 * i} for i in range(12)}
+    del chain["cam0"]["T_cn_cnm1"]
+    (tmp_path / "camchain.yaml").write_text(yaml.safe_dump(chain, sort_keys=True))  # cam10 before cam2, as Kalibr
+    assert run(["import", str(tmp_path / "camchain.yaml"), "--out", str(tmp_path / "rig.toml")]) == 0
+    for name, camera in read_calibration(tmp_path / "rig.toml")[1].items():
+        assert camera.pose.position[0] == pytest.approx(int(name[3:]))
+
+
 def test_kalibr_gets_its_keys_and_a_chain_that_agrees_with_the_poses(calibration: Path, tmp_path: Path) -> None:
     values = yaml.safe_load(export(calibration, "kalibr", tmp_path / "c.yaml").read_text())
     assert list(values) == ["cam0", "cam1", "cam2"]

@@ -52,7 +52,7 @@ def test_fps_replaces_the_time_stamps_of_a_video(video: Path) -> None:
 
 
 def test_an_image_folder_is_played_in_the_order_of_names(tmp_path: Path) -> None:
-    for name, level in (("b.png", 20), ("a.png", 10)):
+    for name, level in (("a10.png", 20), ("a9.png", 10)):
         cv2.imwrite(str(tmp_path / name), np.full((48, 64, 3), level, np.uint8))
     with open_camera(tmp_path, fps=10.0) as camera:
         assert [(int(frame.image.mean()), frame.device_time_ns) for frame in camera] == [(10, 0), (20, 100_000_000)]

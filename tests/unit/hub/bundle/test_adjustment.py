@@ -63,7 +63,7 @@ def simulated_problem(
     problem = Problem(tuple(rows), tuple(lenses), 0, (0, 1), FreeParameters(lens=lens))
     state = AdjustmentState(tuple(cameras), tuple(paths), np.full(3, 0.5))
     size = sum(3 * path.basis.size for path in paths)
-    step = rng.normal(0, perturbation, size), rng.normal(0, perturbation, len(problem.free_columns()))
+    step = rng.normal(0, perturbation, size), rng.normal(0, perturbation, len(problem.free_columns))
     prior = SmoothnessPrior(tuple(np.full(len(path.basis.interval_starts()), 30.0) for path in paths))
     return problem, apply_step(problem, state, *step), prior
 
@@ -73,7 +73,7 @@ def perturbed(camera: CameraState, column: int, by: float) -> CameraState:
     guess = LensPrior(500.0, 0.1, (0.0, 0.0), 9.0, 0.0, 0.1, 0.0, 0.1)
     problem = Problem((), (camera.intrinsics,) * 2, 1, (0, 1), FreeParameters(lens=True, readout=True), (guess, guess))
     both = AdjustmentState((camera, camera), (), np.ones(2))
-    columns = problem.free_columns().tolist()
+    columns = problem.free_columns.tolist()
     step = np.zeros(len(columns))
     step[columns.index(column)] = by
     return apply_step(problem, both, np.zeros(0), step).cameras[0]
@@ -175,7 +175,7 @@ def dense(system: BorderedSystem) -> Floats:
 def test_the_banded_normal_matrix_equals_the_dense_one() -> None:
     problem, state, prior = simulated_problem(5)
     system, _ = build_system(problem, state, SmoothnessPrior(tuple(0 * w for w in prior.weights)), robust=False)
-    columns = problem.free_columns()
+    columns = problem.free_columns
     sizes = [3 * path.basis.size for path in state.trajectories]
     blocks = []
     for rows in problem.rows:
@@ -204,7 +204,7 @@ def test_the_priors_add_their_information() -> None:
     without, _ = build_system(loose, state, prior, robust=False)
     gained = with_priors.corner.diagonal() - without.corner.diagonal()
     free_parameters = problem.free_parameters
-    for value, column in zip(gained, problem.free_columns(), strict=True):
+    for value, column in zip(gained, problem.free_columns, strict=True):
         std = {RATE: free_parameters.rate_std, FOCAL: free_parameters.focal_std, K1: free_parameters.k1_std}.get(
             column % CAMERA_PARAMETERS
         )
@@ -216,15 +216,13 @@ def test_an_unmeasured_lens_is_free_under_its_own_prior_and_the_others_are_not()
     lens = state.cameras[1].intrinsics
     guess = LensPrior(1.1 * lens.focal, 0.2, (300.0, 250.0), 5.0, 0.05, 0.1, -0.02, 0.04)
     one = replace(problem, lens_priors=(None, guess, None))
-    added = set(one.free_columns().tolist()) - set(problem.free_columns().tolist())
+    added = set(one.free_columns.tolist()) - set(problem.free_columns.tolist())
     assert added == {CAMERA_PARAMETERS + column for column in (FOCAL, K1, *range(CENTRE, CAMERA_PARAMETERS))}
     loose = replace(
         one, lens_priors=(None, LensPrior(lens.focal, 1e9, (0.0, 0.0), 1e9, 0.0, 1e9, 0.0, 1e9, 1e9, 1e9, 1e9), None)
     )
     (with_prior, cost), (without, bare) = (build_system(p, state, prior, robust=False) for p in (one, loose))
-    gained = dict(
-        zip(one.free_columns().tolist(), with_prior.corner.diagonal() - without.corner.diagonal(), strict=True)
-    )
+    gained = dict(zip(one.free_columns.tolist(), with_prior.corner.diagonal() - without.corner.diagonal(), strict=True))
     stds = {FOCAL: 0.2, CENTRE: 5.0, CENTRE + 1: 5.0, K1: 0.1, K2: 0.04, K3: 0.01, ASPECT: 2e-3, P1: 2e-3, P1 + 1: 2e-3}
     for column, value in gained.items():
         std = stds.get(column - CAMERA_PARAMETERS)
@@ -323,7 +321,7 @@ def test_steps_perpendicular_to_the_gauge_keep_it() -> None:
     problem, state, _ = simulated_problem(9)
     tangent = null_space(gauge(problem, state))
     np.testing.assert_allclose(tangent.T @ tangent, np.eye(tangent.shape[1]), atol=1e-12)
-    assert tangent.shape == (len(problem.free_columns()), len(problem.free_columns()) - 7)
+    assert tangent.shape == (len(problem.free_columns), len(problem.free_columns) - 7)
     rng = np.random.default_rng(0)
     step = tangent @ rng.normal(0, 1e-5, tangent.shape[1])
     size = sum(3 * path.basis.size for path in state.trajectories)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from scipy.signal import lfilter
 
 from hub.bundle.noise.clock_wander import fit_wander
 from hub.bundle.noise.timestamp_jitter import _is_path_held
-from hub.bundle.problem import CameraState, TrackObservations
+from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations
 from hub.calibration.incremental import update_calibration
 from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import CameraTime
@@ -117,8 +116,9 @@ def test_rows_are_shifted_where_others_hold_the_path_of_their_label(interval: fl
 
     every, early = times >= 0.0, (times < 8.0) | (times > 15.0)
     parts = (rows(0, 0, every), rows(1, 0, every), rows(0, 1, every), rows(1, 1, early), rows(2, 1, times < 5.0))
-    problem, state = SimpleNamespace(rows=parts), SimpleNamespace(cameras=(camera,) * 3)
-    held = [_is_path_held(problem, state, part) for part in parts]  # type: ignore[arg-type]
+    problem = Problem(parts, (camera.intrinsics,) * 3, 0, (0, 1))
+    state = AdjustmentState((camera,) * 3, (), np.ones(3))
+    held = [_is_path_held(problem, state, part) for part in parts]
     assert held[0].all()
     assert held[1].all()
     np.testing.assert_array_equal(held[2], (times < 8.0 - 1e-9) | (times > 15.0))

@@ -168,7 +168,7 @@ def test_every_step_from_the_optimum_increases_the_cost() -> None:
     problem, truth = rig(2)
     prior = estimate_smoothness(problem, truth)
     best = solve_gls(problem, truth, prior, true_noise())
-    free, rng = len(problem.free_columns()), np.random.default_rng(3)
+    free, rng = len(problem.free_columns), np.random.default_rng(3)
     tangent = np.linalg.svd(best.free.submatrix(np.arange(free)))[0][:, : free - 7]
     for _ in range(5):
         path = 1e-4 * rng.normal(size=3 * truth.trajectories[0].basis.size)
@@ -193,7 +193,7 @@ def test_clocks_are_more_accurate_than_with_independent_errors_and_stds_are_cons
         best = solve_gls(problem, state, estimate_smoothness(problem, state), estimate_correlated_noise(problem, state))
         plain.append(clock_errors(state, truth))
         better.append(clock_errors(best.state, truth))
-        covariance = CameraCovariance(problem.free_columns(), CAMERAS, best.free)
+        covariance = CameraCovariance(problem.free_columns, CAMERAS, best.free)
         scaled.append(better[-1] / (1e3 * np.sqrt(covariance.variances[1:, 6])))
     rms = [float(np.sqrt(np.mean(np.square(errors)))) for errors in (plain, better, scaled)]
     assert rms[1] < 0.95 * rms[0]
@@ -256,7 +256,7 @@ def test_the_bayes_factor_of_nominal_lenses_is_the_savage_dickey_ratio() -> None
     """One focal length: nominal lenses win with a posterior as wide as the prior, and lose with a narrow one off it."""
     problem, state = rig(7)
     free_lenses = replace(problem, lens_tolerances=tuple(lens_tolerance(lens) for lens in problem.nominal))
-    columns = free_lenses.free_columns()
+    columns = free_lenses.free_columns
     tight = np.diag(np.full(len(columns), 1e-12))
     first = state.cameras[0]
     off = replace(state, cameras=(replace(first, intrinsics=zoomed(first.intrinsics, 1.005)), *state.cameras[1:]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from hub.calibration.pipeline import calibrate
 from hub.calibration.rigid_body.motion import rotated
 from protocols.core.errors import Refused
 from protocols.geometry import so3
-from protocols.session.calibration import Calibration
+from protocols.session.calibration import Calibration, read_calibration
 from protocols.session.rig import Rig
 from tests.support.board_session import BoardWorld, board_world
+from tests.support.written import write_calibration
 
 
 def errors(world: BoardWorld, found: Calibration) -> dict[str, tuple[float, float, float]]:
@@ -185,3 +187,11 @@ def test_a_board_that_looks_the_same_upside_down_may_be_seen_either_way_by_each_
         assert place < 0.005
         assert turn < 0.2
         assert abs(lag) < 1e-3
+
+
+def test_an_answer_can_be_read_again_though_its_readouts_are_longer_than_a_frame(tmp_path: Path) -> None:
+    # As frames doubled by a converter give: 45 ms of readout at 30 frames a second.
+    world = board_world(3, (30.0, 30.0), 1.0)
+    found = calibrate(world.rig(), world.observations(5.0, readout=0.045))
+    write_calibration(tmp_path / "calibration.toml", found, world.rig())
+    assert read_calibration(tmp_path / "calibration.toml")[1]["cam1"].readout == pytest.approx(1.25 / 30.0)

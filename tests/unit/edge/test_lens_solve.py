@@ -1,0 +1,60 @@
+"""Lenses from exact corners with noise: honest stds, whatever the views leave open, and any fisheye."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge.lens.board import BoardView
+from edge.lens.solve import calibrate_lens
+from protocols.core.errors import Refused
+from protocols.geometry.camera import Intrinsics
+from tests.support import boards
+
+SIZE = (640, 480)
+CORNERS = np.array([[x, y, 0.0] for y in range(1, boards.SQUARES[1]) for x in range(1, boards.SQUARES[0])])
+
+
+def seen(seed: int, count: int, tilt: float, fisheye: bool = False) -> tuple[Intrinsics, list[BoardView]]:
+    """A lens and ``count`` views with 0.15 px of noise, tilted by up to ``tilt`` [rad]."""
+    rng = np.random.default_rng([seed, 9])
+    focal = SIZE[0] * (rng.uniform(0.28, 0.38) if fisheye else rng.uniform(0.6, 1.1))
+    place = 0.5 * (np.array(SIZE) - 1.0) + rng.normal(0.0, 0.012 * SIZE[0], 2)
+    bend = [0.01, -0.003, 0.001, 0.0] if fisheye else [rng.uniform(-0.3, 0.1), rng.uniform(-0.05, 0.1), 0.0, 0.0, 0.0]
+    matrix = np.array([[focal, 0.0, place[0]], [0.0, focal, place[1]], [0.0, 0.0, 1.0]])
+    lens, views = Intrinsics(*SIZE, matrix, np.array(bend), fisheye), []
+    reach = 0.75 if fisheye else 0.35 * SIZE[0] / focal
+    for turn, centre in boards.board_poses(count, seed, tilt, reach):
+        pixels = lens.project((CORNERS - [4.0, 3.0, 0.0]) @ turn.T + centre * focal / 550.0)
+        pixels += rng.normal(0.0, 0.15, pixels.shape)
+        inside = (pixels > 3.0).all(axis=1) & (pixels < np.array(SIZE) - 4.0).all(axis=1)
+        views.append(BoardView(0, CORNERS[inside], pixels[inside]))
+    return lens, [view for view in views if len(view.points) >= 8]
+
+
+@pytest.mark.parametrize("count", [6, 24])
+def test_views_face_on_do_not_determine_a_focal_length(count: int) -> None:
+    for seed in range(4):
+        with pytest.raises(Refused, match="tilt the board"):
+            calibrate_lens(seen(seed, count, 0.0)[1], SIZE)
+
+
+@pytest.mark.parametrize("tilt", [0.3, 0.6])
+def test_the_std_of_a_few_views_holds_what_they_take_for_granted(tilt: float) -> None:
+    scores = []
+    for seed in range(12):
+        lens, views = seen(seed, 4, tilt)
+        try:
+            found = calibrate_lens(views, SIZE)
+        except Refused:
+            continue
+        scores.append(np.log(found.intrinsics.focal / lens.focal) / found.focal_std)
+    assert len(scores) >= 8
+    assert np.sqrt(np.mean(np.square(scores))) < 1.4
+
+
+def test_fisheyes_of_any_field_of_view_are_found() -> None:
+    for seed in range(6):
+        lens, views = seen(seed, 16, 0.6, fisheye=True)
+        found = calibrate_lens(views, SIZE, fisheye=True)
+        assert abs(found.intrinsics.focal / lens.focal - 1.0) < 5.0 * found.focal_std < 0.02
