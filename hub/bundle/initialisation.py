@@ -271,14 +271,15 @@ def _subsampled(problem: Problem, state: AdjustmentState) -> Problem:
 def knot_spacing(cameras: list[CameraInput], label: str) -> float:
     """Knot spacing [s] of a label's trajectory: the finest by the tracks' cross-validation, or half of it.
 
-    Of few frames a knot these, not the motion, limit what a track follows; the path has other cameras' too. What it
-    does not follow all joints of a body do alike, which biases clocks: those of two walkers at 10 to 15 frames a second
-    by up to 5000 ppm, also at true poses; by 500 with half. With six frames and more, as of drones, nothing is gained.
+    Of few frames a knot in each track these, not the motion, limit what it follows; the path has other cameras' too.
+    What it does not follow all joints of a body do alike, which biases clocks: those of two walkers at 10 to 15 frames
+    a second by up to 5000 ppm, also at true poses; by 500 with half. With six, as of drones, nothing is gained.
     """
     tracks = [camera.tracks[label] for camera in cameras if label in camera.tracks]
     rates = [1.0 / float(np.median(np.diff(track.time))) for track in tracks]
-    spacing, rate = min((track.basis.spacing, rate) for track, rate in zip(tracks, rates, strict=True))
-    if spacing * rate < _FEW_FRAMES_PER_KNOT and 0.5 * spacing * sum(rates) > _MANY_ROWS:
+    spacing = min(track.basis.spacing for track in tracks)
+    most = max(track.basis.spacing * rate for track, rate in zip(tracks, rates, strict=True))
+    if most < _FEW_FRAMES_PER_KNOT and 0.5 * spacing * sum(rates) > _MANY_ROWS:
         spacing *= 0.5
     return float(np.clip(spacing, _MIN_KNOT_SPACING, _MAX_KNOT_SPACING))
 
