@@ -32,7 +32,8 @@ STEP_SIZES = np.linspace(-MAX_STEP_S, MAX_STEP_S, 81)
 _REJECTED_SIGMA, _REJECTED_PX, _MIN_EXPLAINED = 5.0, 20.0, 0.5
 """Residual, in sigma and px, from which a row counts as not explained; share of the cost that a step has to remove."""
 _FIRST_ROWS = 500
-"""Rows of a camera in which half of that share is looked for first."""
+"""Rows of a camera in which half of that share is looked for first; of steps put into a recorded flight the same are
+found (`python -m tests.bench.clock_steps --recorded`)."""
 _MIN_SIGMA_SHARE = 1.0 / 3.0
 """Of the cameras' median: noise that a camera has at least where a clock step is looked for."""
 _FEW_ROWS, _FEW_PAIRS, _FEW_INFLATION = 300, 50, 2.5

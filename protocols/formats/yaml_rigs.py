@@ -117,7 +117,7 @@ def read_kalibr(file: Path) -> ForeignRig:
     lenses: dict[str, Intrinsics] = {}
     own: dict[str, TimeMap | None] = {}
     # The chain goes by the number; in Kalibr's files cam10 follows cam1.
-    for key in sorted(values, key=lambda key: int(key[3:]) if re.fullmatch(r"cam\d+", key) else -1):
+    for key in sorted(values, key=lambda key: int(key[3:]) if re.fullmatch("cam[0-9]{1,6}", key) else -1):
         table = values[key]
         if not isinstance(table, dict) or "intrinsics" not in table:
             continue

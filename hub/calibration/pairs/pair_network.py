@@ -11,7 +11,7 @@ are used last, so that they change no lag that the images determine.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from hub.bundle.preprocessing import PreparedSession
 from hub.calibration.pairs.pair_overlap import LARGE_NETWORK, candidate_pairs
+from hub.calibration.pairs.synchronised_groups import ENOUGH_PAIRS, MIN_REDUNDANT, SynchronisedGroups, time_span
 from hub.clocks.clock_graph import connected_components
 from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior
 from hub.sync.common_clock import solve_common_clock_pair
@@ -39,15 +40,11 @@ RATE_TOLERANCE = 0.01
 """Relative rate error above which times must have been made with a wrong frame rate: no clock is off by that much."""
 _RATIO_TOLERANCE = 0.01  # relative: 29.97 counts as 30
 _SMALL_NETWORK = 8  # cameras up to which all failed guided searches are repeated over all lags
-_MIN_REDUNDANT = 3  # cameras from which on pairs are checked against each other
 _LONG_OVERLAP = 8.0  # s of common motion
-_ENOUGH_PAIRS = 2  # of a new camera with placed ones: the second checks the first
 _FEW_CANDIDATES = 2
 """Lags that are refined, while none of them is reliable, for a camera that resection can still find: in 48 of 48 pairs
 of 12 simulated and 2 real rigs the first one was reliable, and a camera that is broken costs a search of all 18."""
 _MIN_CONTRADICTIONS = 2  # pairs that refute the only other pair of a camera
-_MAX_PAIR_NOISE = 2.0
-"""Median residual of a camera's pairs, over that of the best pairs of all: above it its lens may be wrong."""
 _MAX_PRIOR_WINDOW = 0.5  # s on either side: a less precise prior selects nothing
 
 
@@ -73,12 +70,12 @@ def solve_pairs(
     is_large = len(names) > _SMALL_NETWORK and not prepared.shared_clock
     pairs: dict[tuple[str, str], PairSolution] = {}
     unguided: dict[tuple[str, str], PairSolution] = {}
-    synchronised, cache = _SynchronisedGroups(), TrackCache()
+    synchronised, cache = SynchronisedGroups(), TrackCache()
     is_ranked = len(todo) > 1 and not prepared.shared_clock
     queue = deque(_ranked(prepared, todo, report, cache) if is_ranked else todo)
     postponed = set[tuple[str, str]]()
     # Resection against the path of three other cameras finds what a short search does not.
-    is_spared = thorough == "first pair" and len(prepared.cameras) > _MIN_REDUNDANT
+    is_spared = thorough == "first pair" and len(prepared.cameras) > MIN_REDUNDANT
     while queue:
         a, b = queue.popleft()
         if thorough == "first pair" and (a, b) not in postponed and synchronised.has_failed(a, b, pairs.values()):
@@ -100,7 +97,7 @@ def solve_pairs(
                 synchronised.add(solution)
                 continue
         # A pair that was not searched completely is left as it is if by now others connect three cameras.
-        is_done = (a, b) in pairs and max(synchronised.size(a), synchronised.size(b)) >= _MIN_REDUNDANT
+        is_done = (a, b) in pairs and max(synchronised.size(a), synchronised.size(b)) >= MIN_REDUNDANT
         may_leave = thorough == "first pair" and predicted_lag is None
         if is_done or (may_leave and synchronised.leaves(a, b, pairs.values())):
             unsearched = PairSolution(a, b, "not searched: the most promising pair of the same camera had failed")
@@ -111,7 +108,7 @@ def solve_pairs(
         solution = _solve(prepared, (a, b), known, predicted_lag=predicted_lag, settings=brief, cache=cache)
         # If the predicted lag is right, a pair with a long overlap must agree with it; else it is solved over all lags.
         again = predicted_lag is not None and not solution.solved and (not is_large or _has_long_overlap(solution))
-        if again and not (spared and synchronised.size(a) > _MIN_REDUNDANT):
+        if again and not (spared and synchronised.size(a) > MIN_REDUNDANT):
             solution, predicted_lag = _solve(prepared, (a, b), known, settings=brief, cache=cache), None
         if predicted_lag is None:
             unguided[a, b] = solution
@@ -120,12 +117,12 @@ def solve_pairs(
             prepared = replace(prepared, warnings=prepared.warnings + warning)
         pairs[a, b] = solution
         synchronised.add(solution)
-        if solution.incomplete and max(synchronised.size(a), synchronised.size(b)) < _MIN_REDUNDANT:
+        if solution.incomplete and max(synchronised.size(a), synchronised.size(b)) < MIN_REDUNDANT:
             queue.append((a, b))  # all its lags are searched if no other pairs connect three cameras
     pairs = {both: pairs[both] for both in todo}  # in the rig's order
     if thorough == "first pair" and not prepared.shared_clock:
         _leave_to_resection(pairs, prepared.cameras)
-    if len(names) >= _MIN_REDUNDANT and not prepared.shared_clock and known is None:
+    if len(names) >= MIN_REDUNDANT and not prepared.shared_clock and known is None:
         # Those selected by external clock priors are ambiguous over all lags.
         for both in [one for one in _isolated_pairs(pairs) if unguided.get(one) is pairs[one]]:
             report(f"pair {both[0]}–{both[1]} by itself", 0.56)
@@ -158,7 +155,7 @@ def solve_new_pairs(
                 prepared = replace(prepared, warnings=prepared.warnings + warning)
             out.append(solution)
             solved += solution.solved
-            if solved >= _ENOUGH_PAIRS:
+            if solved >= ENOUGH_PAIRS:
                 break
     return prepared, out
 
@@ -175,7 +172,7 @@ def _leave_to_resection(pairs: dict[tuple[str, str], PairSolution], calibrated: 
     for (a, b), pair in pairs.items():
         for name, other in ((a, b), (b, a)):
             contradicted = refuted[name] >= max(_MIN_CONTRADICTIONS, solved[name] + 1)
-            alone = name in calibrated and solved[name] == 1 and solved[other] >= _MIN_REDUNDANT
+            alone = name in calibrated and solved[name] == 1 and solved[other] >= MIN_REDUNDANT
             if pair.solved and alone and contradicted:
                 text = f"its lag contradicts {refuted[name]} other pairs of {name}"
                 pairs[a, b] = replace(pair, status=text)
@@ -257,77 +254,6 @@ def _ranked(
     return sorted(todo, key=lambda pair: -scores[pair])
 
 
-class _SynchronisedGroups:
-    """Groups of cameras connected by solved pairs, each with a common time: ``t_group = rate * t + offset``."""
-
-    def __init__(self) -> None:
-        self._maps: dict[str, tuple[str, float, float]] = {}
-        self._residuals: dict[str, list[float]] = {}
-
-    def has_enough(self, a: str, b: str) -> bool:
-        """Whether two cameras are in one group, and each in pairs that check each other."""
-        one, other = (self._maps.get(name, ("", 0.0, 0.0))[0] for name in (a, b))
-        return bool(one) and one == other and all(len(self._residuals[name]) > _ENOUGH_PAIRS for name in (a, b))
-
-    def add(self, pair: PairSolution) -> None:
-        """Merge the groups of a solved pair's cameras; a pair within one group changes nothing."""
-        if not pair.solved or pair.fit is None:
-            return
-        for name in (pair.a, pair.b):
-            self._residuals.setdefault(name, []).append(pair.fit.residual_px)
-            self._maps.setdefault(name, (name, 1.0, 0.0))
-        (group_a, rate_a, offset_a), (group_b, rate_b, offset_b) = self._maps[pair.a], self._maps[pair.b]
-        if group_a == group_b:
-            return
-        # t_a = rate t_b + offset, so group a's time from group b's
-        rate = rate_a * pair.fit.rate / rate_b
-        offset = rate_a * pair.fit.offset + offset_a - rate * offset_b
-        for name, (group, r, o) in list(self._maps.items()):
-            if group == group_b:
-                self._maps[name] = (group_a, rate * r, rate * o + offset)
-
-    def size(self, name: str) -> int:
-        """Number of cameras in the group of a camera; 0 where it is connected to none."""
-        group = self._maps.get(name, ("", 1.0, 0.0))[0]
-        return sum(other == group for other, _, _ in self._maps.values())
-
-    def leaves(self, a: str, b: str, pairs: Iterable[PairSolution]) -> bool:
-        """Whether one of two cameras is in a group of three or more, and the other's best pair with it has failed.
-
-        A failed pair with a camera whose own pairs fit far worse than the others' says nothing about the new one.
-        """
-        groups = Counter(group for group, _, _ in self._maps.values())
-        most = _MAX_PAIR_NOISE * np.median([min(pixels) for pixels in self._residuals.values()] or [np.inf])
-        for new, old in ((a, b), (b, a)):
-            group = self._maps.get(old, ("", 1.0, 0.0))[0]
-            if new in self._maps or groups[group] < _MIN_REDUNDANT:
-                continue
-            tried = [pair.b if pair.a == new else pair.a for pair in pairs if new in (pair.a, pair.b)]
-            inside = [other for other in tried if self._maps.get(other, ("", 1.0, 0.0))[0] == group]
-            if any(np.median(self._residuals[other]) <= most for other in inside):
-                return True
-        return False
-
-    def has_failed(self, a: str, b: str, pairs: Iterable[PairSolution]) -> bool:
-        """Whether one of two cameras is connected to none, and a pair of it with a connected one has failed."""
-        tried = [(pair.a, pair.b) for pair in pairs]
-        return any(
-            new not in self._maps and any(new in both and any(one in self._maps for one in both) for both in tried)
-            for new in (a, b)
-        )
-
-    def lag(self, prepared: PreparedSession, a: str, b: str) -> float | None:
-        """``t_a - t_b`` [s] in the middle of the common recording time; None if they are not connected."""
-        if a not in self._maps or b not in self._maps or self._maps[a][0] != self._maps[b][0]:
-            return None
-        (_, rate_a, offset_a), (_, rate_b, offset_b) = self._maps[a], self._maps[b]
-        rate, offset = rate_b / rate_a, (offset_b - offset_a) / rate_a
-        begin_a, end_a = _time_span(prepared, a)
-        begin_b, end_b = (rate * time + offset for time in _time_span(prepared, b))
-        middle = 0.5 * (max(begin_a, begin_b) + min(end_a, end_b))
-        return middle - (middle - offset) / rate
-
-
 def _solve(
     prepared: PreparedSession,
     names: tuple[str, str],
@@ -351,7 +277,7 @@ def _solve(
         given = relative_pose_between(*poses)
     calibrated = all(name in prepared.cameras for name in names)
     # With more cameras the adjustment estimates lenses and tests each clock: an imprecise lag suffices to start.
-    settings = replace(settings or PairSettings(), standalone=standalone or len(prepared.names) < _MIN_REDUNDANT)
+    settings = replace(settings or PairSettings(), standalone=standalone or len(prepared.names) < MIN_REDUNDANT)
     if given is not None:
         settings = replace(settings, min_planar_ratio=0.0)  # a given geometry is not left open by planar motion
     return solve_pair(
@@ -503,13 +429,8 @@ def describe_failures(name: str, pairs: list[PairSolution]) -> str:
 
 def pair_lag(prepared: PreparedSession, pair: PairSolution, fit: PairFit) -> float:
     """``t_a - t_b`` [s] on the cameras' own clocks, in the middle of the common recording time."""
-    begin_a, end_a = _time_span(prepared, pair.a)
-    begin_b, end_b = (fit.rate * time + fit.offset for time in _time_span(prepared, pair.b))
+    begin_a, end_a = time_span(prepared, pair.a)
+    begin_b, end_b = (fit.rate * time + fit.offset for time in time_span(prepared, pair.b))
     middle = 0.5 * (max(begin_a, begin_b) + min(end_a, end_b))
     shown_a = prepared.time_origins[pair.a] + middle / prepared.time_scale(pair.a)
     return shown_a - prepared.time_origins[pair.b] - (middle - fit.offset) / fit.rate / prepared.time_scale(pair.b)
-
-
-def _time_span(prepared: PreparedSession, name: str) -> tuple[float, float]:
-    tracks = prepared.camera(name).tracks.values()
-    return min(float(track.time[0]) for track in tracks), max(float(track.time[-1]) for track in tracks)

