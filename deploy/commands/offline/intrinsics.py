@@ -119,6 +119,7 @@ def intrinsics(
             "views": fit.views,
             "rms_px": fit.rms_px,
             "focal_std": fit.focal_std,
+            "bow": fit.bow,
             "coverage": fit.coverage,
             "cells": fit.cells.tolist(),
         }
@@ -132,6 +133,8 @@ def intrinsics(
         lines = [f"{focal} {lens.focal:.2f} px ± {100 * fit.focal_std:.2g} %, {fit.views} views"]
         if guess_std:
             lines.append(f"approximate: fewer than {MIN_VIEWS} different views; `syncline calibrate` refines it")
+        if fit.bow:
+            lines.append(f"the board is bowed by {fit.bow:.2g} of a square, which was allowed for")
         covered = f"corners in each part of the image ({100 * fit.coverage:.0f} %):"
         lines += [f"corners fit to {fit.rms_px:.3f} px; {covered}", *coverage_map(fit.cells)]
     return answer(document, [*lines, *closing_lines((), [out])], json)

@@ -15,8 +15,10 @@ SIZE = (640, 480)
 CORNERS = np.array([[x, y, 0.0] for y in range(1, boards.SQUARES[1]) for x in range(1, boards.SQUARES[0])])
 
 
-def seen(seed: int, count: int, tilt: float, fisheye: bool = False) -> tuple[Intrinsics, list[BoardView]]:
-    """A lens and ``count`` views with 0.15 px of noise, tilted by up to ``tilt`` [rad]."""
+def seen(
+    seed: int, count: int, tilt: float, fisheye: bool = False, bow: float = 0.0
+) -> tuple[Intrinsics, list[BoardView]]:
+    """A lens and ``count`` views with 0.15 px of noise, tilted by up to ``tilt`` [rad], of a board bowed by ``bow``."""
     rng = np.random.default_rng([seed, 9])
     focal = SIZE[0] * (rng.uniform(0.28, 0.38) if fisheye else rng.uniform(0.6, 1.1))
     place = 0.5 * (np.array(SIZE) - 1.0) + rng.normal(0.0, 0.012 * SIZE[0], 2)
@@ -24,8 +26,10 @@ def seen(seed: int, count: int, tilt: float, fisheye: bool = False) -> tuple[Int
     matrix = np.array([[focal, 0.0, place[0]], [0.0, focal, place[1]], [0.0, 0.0, 1.0]])
     lens, views = Intrinsics(*SIZE, matrix, np.array(bend), fisheye), []
     reach = 0.75 if fisheye else 0.35 * SIZE[0] / focal
+    board = CORNERS - [4.0, 3.0, 0.0]
+    board[:, 2] -= bow * (board[:, 0] / 3.0) ** 2
     for turn, centre in boards.board_poses(count, seed, tilt, reach):
-        pixels = lens.project((CORNERS - [4.0, 3.0, 0.0]) @ turn.T + centre * focal / 550.0)
+        pixels = lens.project(board @ turn.T + centre * focal / 550.0)
         pixels += rng.normal(0.0, 0.15, pixels.shape)
         inside = (pixels > 3.0).all(axis=1) & (pixels < np.array(SIZE) - 4.0).all(axis=1)
         views.append(BoardView(0, CORNERS[inside], pixels[inside]))
@@ -58,3 +62,15 @@ def test_fisheyes_of_any_field_of_view_are_found() -> None:
         lens, views = seen(seed, 16, 0.6, fisheye=True)
         found = calibrate_lens(views, SIZE, fisheye=True)
         assert abs(found.intrinsics.focal / lens.focal - 1.0) < 5.0 * found.focal_std < 0.02
+
+
+@pytest.mark.parametrize(("count", "fisheye"), [(5, False), (24, False), (16, True)])
+def test_a_bowed_board_is_told_and_its_focal_length_as_good_as_a_flat_ones(count: int, fisheye: bool) -> None:
+    scores = []
+    for seed in range(6):
+        lens, views = seen(seed, count, 0.6, fisheye, bow=0.05)
+        found = calibrate_lens(views, SIZE, fisheye)
+        scores.append(np.log(found.intrinsics.focal / lens.focal) / found.focal_std)
+        assert found.bow == pytest.approx(0.05, abs=0.015)
+        assert calibrate_lens(seen(seed, count, 0.6, fisheye)[1], SIZE, fisheye).bow == 0.0
+    assert np.sqrt(np.mean(np.square(scores))) < 1.8
