@@ -114,9 +114,9 @@ def _reject_single_views(parts: list[TrackObservations], state: AdjustmentState)
 
 def gauge(problem: Problem, state: AdjustmentState) -> Floats:
     """Orthonormal directions (7, p) in which the free camera parameters do not move: the pose of the first anchor and
-    the distance between the two anchors. (0, p) where poses are not free."""
+    the distance between the two anchors. (0, p) where poses are not free, or those of some cameras are held."""
     columns = problem.free_columns
-    if not problem.free_parameters.pose:
+    if problem.held or not problem.free_parameters.pose:
         return np.zeros((0, len(columns)))
     first, second = problem.anchors
     width = len(state.cameras) * CAMERA_PARAMETERS

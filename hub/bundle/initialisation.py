@@ -520,8 +520,7 @@ def inlier_share(reconstruction: Reconstruction, name: str) -> tuple[float, int]
     sigma = min(float(state.sigma[number]), sigma_limit(state, number))
     norms = [
         residual_norms(rows, reconstruction.state.cameras[number], reconstruction.state.trajectories[rows.label])
-        for rows in reconstruction.problem.rows
-        if rows.camera == number
+        for rows in reconstruction.problem.of_camera(number)
     ]
     values = np.concatenate(norms) if norms else np.zeros(0)
     values = values[np.isfinite(values)]

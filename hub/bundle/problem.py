@@ -232,7 +232,7 @@ class Problem:
     readout_given: by camera, whether its readout was given, so that the rows' times are already corrected; () = none
     was. lens_tolerances: by camera, priors for given lenses that are estimated all the same; () = they are fixed.
     crystal_rates: by camera, whether its rate differs from the reference's only as two crystals do
-    (`CRYSTAL_RATE_STD`); () = not decided.
+    (`CRYSTAL_RATE_STD`); () = not decided. held: cameras of which nothing is free; any of them fix the gauge.
     """
 
     rows: tuple[TrackObservations, ...]
@@ -244,6 +244,7 @@ class Problem:
     readout_given: tuple[bool, ...] = ()
     lens_tolerances: tuple[LensPrior, ...] = ()
     crystal_rates: tuple[bool, ...] = ()
+    held: frozenset[int] = frozenset()
 
     @cached_property
     def by_camera(self) -> dict[int, tuple[TrackObservations, ...]]:
@@ -289,7 +290,7 @@ class Problem:
     def free_columns(self) -> Ints:
         """Indices of the free camera parameters in the stacked vector of CAMERA_PARAMETERS each."""
         columns: list[int] = []
-        for camera in range(len(self.nominal)):
+        for camera in (one for one in range(len(self.nominal)) if one not in self.held):
             base = camera * CAMERA_PARAMETERS
             if self.free_parameters.pose:
                 columns += range(base, base + 6)
