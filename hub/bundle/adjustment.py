@@ -133,7 +133,7 @@ def apply_step(problem: Problem, state: AdjustmentState, path_step: Floats, came
     full = np.zeros(len(state.cameras) * CAMERA_PARAMETERS)
     full[problem.free_columns] = camera_step
     cameras = tuple(
-        apply_camera_step(camera, full[i * CAMERA_PARAMETERS : (i + 1) * CAMERA_PARAMETERS])
+        camera if i in problem.held else apply_camera_step(camera, full[i * CAMERA_PARAMETERS :][:CAMERA_PARAMETERS])
         for i, camera in enumerate(state.cameras)
     )
     paths, at = [], 0
