@@ -14,6 +14,7 @@ import numpy as np
 
 from hub.bundle.adjustment import adjust, mark_inliers
 from hub.bundle.problem import (
+    LARGE_NETWORK,
     AdjustmentState,
     CameraState,
     FreeParameters,
@@ -44,9 +45,8 @@ _MIN_KNOT_SPACING, _MAX_KNOT_SPACING = 0.05, 0.3  # s
 _FEW_FRAMES_PER_KNOT, _MANY_ROWS = 4.5, 3.0  # of a track's choice; of all cameras, to each of twice as many knots
 _MAX_INITIAL_ROWS, _MIN_ROWS_PER_KNOT = 5_000, 2.0  # of more rows, early adjustments use a share
 _SMALL_NETWORK, _ADJUST_GROWTH = 6, 1.33  # cameras; growth
-_LARGE_NETWORK, _TOGETHER = 32, 0.5
-"""Cameras from which on several are placed at once, of that share of the best one's score or more, and only what is
-new is adjusted: the final adjustment is of all."""
+_TOGETHER = 0.5
+"""Of the best one's score: a large network grows by all such cameras at once, and only what is new is adjusted."""
 _TRIANGULATION_STEP = 0.05  # s between triangulated points
 SEEN_WITHIN_S = 0.2  # a camera observes a point at a time if it has an observation this near
 _MAX_GAP = 1.0  # s: the trajectory is split where no camera saw the point for longer
@@ -155,7 +155,7 @@ def place_cameras(
         current = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
         best = max(unplaced, key=lambda one: scores[one][1])
         together = [best]
-        if len(current) >= _LARGE_NETWORK:
+        if len(current) > LARGE_NETWORK:
             together += [one for one in unplaced if one != best and scores[one][1] > _TOGETHER * scores[best][1]]
         for name in together:
             if progress is not None:
@@ -175,13 +175,13 @@ def place_cameras(
             continue
         # The cost grows with the network: a large one is adjusted only when it has grown by a third.
         if len(current) <= _SMALL_NETWORK or len(current) >= _ADJUST_GROWTH * len(adjusted) or not unplaced:
-            moving = current.keys() - adjusted if len(current) >= _LARGE_NETWORK else ()
+            moving = current.keys() - adjusted if len(current) > LARGE_NETWORK else ()
             reconstruction, adjusted = grown(current, moving, free_parameters), current.keys()
         else:
             reconstruction = grown(current, (), None)
     if len(adjusted) < len(reconstruction.names):
         current = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
-        moving = current.keys() - adjusted if len(current) >= _LARGE_NETWORK else ()
+        moving = current.keys() - adjusted if len(current) > LARGE_NETWORK else ()
         reconstruction = grown(current, moving, free_parameters)
     return reconstruction, refused
 

@@ -12,7 +12,7 @@ from hub.bundle.initialisation import Reconstruction, sigma_limit
 from hub.bundle.noise.correlated_noise import refit_with_correlated_noise
 from hub.bundle.noise.noise_scale import correlation_inflation
 from hub.bundle.noise.timestamp_jitter import estimate_frame_times
-from hub.bundle.problem import AdjustmentState, ClockStep, Problem
+from hub.bundle.problem import LARGE_NETWORK, AdjustmentState, ClockStep, Problem
 from hub.bundle.residuals import residual_norms
 from hub.calibration.acceptance import misfits, wrong_lens
 from hub.calibration.pairs.pair_network import Progress
@@ -20,7 +20,6 @@ from protocols.geometry.types import Floats
 
 MAX_CLOCK_STEPS, _STEP_ITERATIONS = 2, 2  # steps of all clocks in one recording; Gauss-Newton steps for each
 _STEP_TOLERANCE = 0.5  # what is left of a size, in stds
-_LARGE_NETWORK = 32  # cameras from which on two robust rounds are enough: paths that many see are good to begin with
 _ONLINE_MIN_INFLATION = 2.0  # rows per effective row from which the noise of a recording that goes on is correlated
 _MAX_ONLINE_ROW_RATE = 120.0  # rows a second, of all cameras
 
@@ -143,7 +142,7 @@ def final_adjustment(
         step = None if lens is None else clock_steps.find_clock_step(problem, state)
         if lens is not None and (step is None or step.statistic < lens.statistic):
             return reconstruction  # the camera will be left out
-    rounds = 2 if warm or len(state.cameras) > _LARGE_NETWORK else 4
+    rounds = 2 if warm or len(state.cameras) > LARGE_NETWORK else 4
     problem, state, _ = adjust(problem, state, rounds=rounds, progress=lambda text: report(text, 0.75))
     if not (warm and online):
         even = problem, state

@@ -20,6 +20,7 @@ from hub.bundle.covariance import Covariance, covariance, inverse_blocks
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
     CAMERA_PARAMETERS,
+    LARGE_NETWORK,
     OFFSET,
     AdjustmentState,
     FreeParameters,
@@ -87,7 +88,9 @@ def rescale_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPri
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return state
     found, none = covariance(problem, state, prior, longest=True), np.zeros(len(state.cameras))
-    noise = _over_redundancy(residual_std(problem, state), problem, state, found, none, _MAX_ROWS)
+    # A camera's redundancy follows from few rows of it, and many cameras that see a label cost each of them more.
+    most_rows = _MAX_ROWS if len(none) <= LARGE_NETWORK else _MAX_ROWS_IN_ROUNDS
+    noise = _over_redundancy(residual_std(problem, state), problem, state, found, none, most_rows)
     modelled = [modelled_inflation(problem, state, camera) for camera in range(len(state.cameras))]
     return replace(state, sigma=noise * np.sqrt(np.maximum(correlation_inflation(problem, state), modelled)))
 
