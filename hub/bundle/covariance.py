@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +13,7 @@ from scipy.special import erf
 from hub.bundle.block_matrix import BlockSum, BlockTridiagonal, DenseCovariance, ParameterCovariance, SparseCovariance
 from hub.bundle.bordered_system import BAND, Elimination, PathByCameras, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
-from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, RATE, AdjustmentState, Problem
+from hub.bundle.problem import CAMERA_PARAMETERS, LARGE_NETWORK, OFFSET, RATE, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior, deformation_terms
 from hub.trajectory.banded import cho_solve_banded
 from hub.trajectory.splines import SUPPORT, weighted_sums
@@ -49,9 +49,10 @@ class CameraCovariance:
         out[np.ix_(is_free, is_free)] = self.free.submatrix(place[is_free])
         return out
 
-    def of_each_camera(self, *parameters: int) -> Floats:
-        """(n k, n k) covariance of k parameters of every camera."""
-        return self.of((np.arange(self.cameras)[:, None] * CAMERA_PARAMETERS + np.array(parameters)).ravel())
+    def of_each_camera(self, *parameters: int, cameras: Ints | None = None) -> Floats:
+        """(n k, n k) covariance of k parameters of every camera, or of ``cameras`` (n,)."""
+        chosen = np.arange(self.cameras) if cameras is None else cameras
+        return self.of((chosen[:, None] * CAMERA_PARAMETERS + np.array(parameters)).ravel())
 
     @cached_property
     def variances(self) -> Floats:
@@ -198,11 +199,34 @@ def _complement(fixed: Floats) -> csr_array[Any]:
     return csr_array(block_diag([eye_array(int((~touched).sum())), mixed]))[np.argsort(places)]
 
 
-def relative_rotation_stds(cov: CameraCovariance, state: AdjustmentState) -> Floats:
-    """(n, n) largest std [rad] of the rotation between two cameras over all axes; independent of the gauge."""
+def smallest_relative_stds(cov: CameraCovariance, problem: Problem, state: AdjustmentState) -> tuple[Floats, Floats]:
+    """(n,) std [rad] of each camera's rotation and (n,) std [s] of its clock, relative to the camera to which it is
+    known best: of a large network, among those that share a label with it."""
+    count, middle = len(state.cameras), middles_of_overlap(problem, state)
+    groups = [np.arange(count)]
+    if count > LARGE_NETWORK:
+        groups = [np.unique([rows.camera for rows in parts]) for parts in problem.by_label.values()]
+    rotations, clocks = np.full((2, count), np.inf)
+    for group in groups:
+        of_group = replace(state, cameras=tuple(state.cameras[i] for i in group))
+        within = middle[np.ix_(group, group)]
+        for best, between in (
+            (rotations, relative_rotation_stds(cov, of_group, group)),
+            (clocks, _clock_stds(cov.of_each_camera(OFFSET, RATE, cameras=group), of_group, within)),
+        ):
+            np.fill_diagonal(between, np.inf)
+            best[group] = np.minimum(best[group], between.min(axis=1))
+    return rotations, clocks
+
+
+def relative_rotation_stds(cov: CameraCovariance, state: AdjustmentState, cameras: Ints | None = None) -> Floats:
+    """(n, n) largest std [rad] of the rotation between two cameras over all axes; independent of the gauge.
+
+    cameras: (n,) indices of the state's cameras in the covariance; None = all.
+    """
     count = len(state.cameras)
     out = np.zeros((count, count))
-    blocks = cov.of_each_camera(0, 1, 2).reshape(count, 3, count, 3).transpose(0, 2, 1, 3)
+    blocks = cov.of_each_camera(0, 1, 2, cameras=cameras).reshape(count, 3, count, 3).transpose(0, 2, 1, 3)
     own = np.array([blocks[i, i] for i in range(count)])
     turned = np.array([camera.pose.rotation.T for camera in state.cameras])
     for i in range(1, count):
@@ -296,10 +320,14 @@ def relative_clock_stds(cov: CameraCovariance, problem: Problem, state: Adjustme
     That is where their lag is used; away from it the uncertain rates increase the std. For cameras without a common
     span: in the middle of the gap. Diagonal 0.
     """
-    middle = middles_of_overlap(problem, state)
+    return _clock_stds(cov.clocks, state, middles_of_overlap(problem, state))
+
+
+def _clock_stds(clocks: Floats, state: AdjustmentState, middle: Floats) -> Floats:
+    """The same of (2 n, 2 n) covariances of offset and rate, at internal times ``middle`` (n, n)."""
     offsets, rates = (np.array([getattr(camera, name) for camera in state.cameras]) for name in ("offset", "rate"))
     change = (middle - offsets[:, None]) / rates[:, None]  # of a camera's (first index) map by its rate
-    offset, mixed, rate = (cov.clocks[a::2, b::2] for a, b in ((0, 0), (1, 0), (1, 1)))
+    offset, mixed, rate = (clocks[a::2, b::2] for a, b in ((0, 0), (1, 0), (1, 1)))
     own = np.diag(offset)[:, None] + 2.0 * change * np.diag(mixed)[:, None] + change**2 * np.diag(rate)[:, None]
     shared = offset + change * mixed + change.T * mixed.T + change * change.T * rate
     variance = own + own.T - 2.0 * shared

@@ -6,7 +6,7 @@ resected against a consistent reconstruction.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -14,6 +14,7 @@ import numpy as np
 
 from hub.bundle.adjustment import adjust, mark_inliers
 from hub.bundle.problem import (
+    LARGE_NETWORK,
     AdjustmentState,
     CameraState,
     FreeParameters,
@@ -44,6 +45,8 @@ _MIN_KNOT_SPACING, _MAX_KNOT_SPACING = 0.05, 0.3  # s
 _FEW_FRAMES_PER_KNOT, _MANY_ROWS = 4.5, 3.0  # of a track's choice; of all cameras, to each of twice as many knots
 _MAX_INITIAL_ROWS, _MIN_ROWS_PER_KNOT = 5_000, 2.0  # of more rows, early adjustments use a share
 _SMALL_NETWORK, _ADJUST_GROWTH = 6, 1.33  # cameras; growth
+_TOGETHER = 0.5
+"""Of the best one's score: a large network grows by all such cameras at once, and only what is new is adjusted."""
 _TRIANGULATION_STEP = 0.05  # s between triangulated points
 SEEN_WITHIN_S = 0.2  # a camera observes a point at a time if it has an observation this near
 _MAX_GAP = 1.0  # s: the trajectory is split where no camera saw the point for longer
@@ -134,8 +137,12 @@ def place_cameras(
     first, second = [name for name in cameras if name in placed][:2]
     anchors = anchors or (first, second)
     kept = _Triangulated(cameras, labels)
-    reconstruction = triangulate_and_adjust(cameras, placed, rows, labels, anchors, free_parameters, kept)
-    adjusted = len(placed)
+
+    def grown(current: dict[str, CameraState], moving: Collection[str], free: FreeParameters | None) -> Reconstruction:
+        return triangulate_and_adjust(cameras, current, rows, labels, anchors, free, kept, moving)
+
+    reconstruction = grown(placed, (), free_parameters)
+    adjusted = placed.keys()
     unplaced = [name for name in graph.clocks if name not in placed]
     scores: dict[str, tuple[tuple[object, ...], float]] = {}  # and what each depends on
     while unplaced:
@@ -145,29 +152,37 @@ def place_cameras(
             depends = (reference, *map(paths.get, cameras[name].tracks))
             if name not in scores or scores[name][0] != depends:
                 scores[name] = depends, _resection_score(cameras[name], graph, reconstruction, kept)
-        name = max(unplaced, key=lambda one: scores[one][1])
-        unplaced.remove(name)
-        if progress is not None:
-            progress(f"placing {name}")
-        state = _resect(cameras[name], graph, reconstruction, kept) or _intersect_bearings(
-            cameras[name], graph, reconstruction
-        )
-        if state is None:
-            refused[name] = (
-                "its view of the trajectory agrees with no position (too little seen together with the other cameras)"
-            )
-            continue
         current = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
-        current[name] = state
+        best = max(unplaced, key=lambda one: scores[one][1])
+        together = [best]
+        if len(current) > LARGE_NETWORK:
+            together += [one for one in unplaced if one != best and scores[one][1] > _TOGETHER * scores[best][1]]
+        for name in together:
+            if progress is not None:
+                progress(f"placing {name}")
+            state = _resect(cameras[name], graph, reconstruction, kept) or _intersect_bearings(
+                cameras[name], graph, reconstruction
+            )
+            if state is not None:
+                current[name] = state
+            elif name == best:
+                refused[name] = (
+                    "its view of the trajectory agrees with no position (too little seen together with the other "
+                    "cameras)"
+                )
+        unplaced = [name for name in unplaced if name not in current and name not in refused]
+        if len(current) == len(reconstruction.names):
+            continue
         # The cost grows with the network: a large one is adjusted only when it has grown by a third.
-        adjust_now = len(current) <= _SMALL_NETWORK or len(current) >= _ADJUST_GROWTH * adjusted or not unplaced
-        reconstruction = triangulate_and_adjust(
-            cameras, current, rows, labels, anchors, free_parameters if adjust_now else None, kept
-        )
-        adjusted = len(current) if adjust_now else adjusted
-    if adjusted < len(reconstruction.names):
-        placed = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
-        reconstruction = triangulate_and_adjust(cameras, placed, rows, labels, anchors, free_parameters, kept)
+        if len(current) <= _SMALL_NETWORK or len(current) >= _ADJUST_GROWTH * len(adjusted) or not unplaced:
+            moving = current.keys() - adjusted if len(current) > LARGE_NETWORK else ()
+            reconstruction, adjusted = grown(current, moving, free_parameters), current.keys()
+        else:
+            reconstruction = grown(current, (), None)
+    if len(adjusted) < len(reconstruction.names):
+        current = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
+        moving = current.keys() - adjusted if len(current) > LARGE_NETWORK else ()
+        reconstruction = grown(current, moving, free_parameters)
     return reconstruction, refused
 
 
@@ -216,8 +231,12 @@ def triangulate_and_adjust(
     anchors: tuple[str, str],
     free_parameters: FreeParameters | None,
     kept: _Triangulated | None = None,
+    moving: Collection[str] = (),
 ) -> Reconstruction:
-    """Triangulate trajectories from the placed cameras and adjust briefly. Raises Refused without any trajectory."""
+    """Triangulate trajectories from the placed cameras and adjust briefly. Raises Refused without any trajectory.
+
+    moving: the only cameras that are adjusted, with the trajectories that they see; () = all.
+    """
     kept = kept or _Triangulated(cameras, labels)
     numbers = {name: number for number, name in enumerate(name for name in cameras if name in placed)}
     names = list(numbers)
@@ -247,11 +266,26 @@ def triangulate_and_adjust(
     state = AdjustmentState(tuple(states), tuple(trajectories), np.full(len(names), 2.0))
     if not used:
         raise Refused("no part of the trajectory is seen by two cameras with enough parallax")
-    if free_parameters is not None:
+    if free_parameters is not None and moving:
+        state = _adjusted_among(problem, state, {numbers[name] for name in moving})
+    elif free_parameters is not None:
         subsampled = _subsampled(problem, state)
         adjusted, state, _ = adjust(subsampled, state, iterations=12, rounds=2, coarse=True)
         problem = adjusted if subsampled is problem else mark_inliers(problem, state)
     return Reconstruction(names, [labels[label] for label in used], problem, state)
+
+
+def _adjusted_among(problem: Problem, state: AdjustmentState, moving: set[int]) -> AdjustmentState:
+    """The state with some cameras adjusted, and the trajectories that they see, while the other cameras are held."""
+    labels = sorted({rows.label for camera in moving for rows in problem.of_camera(camera)})
+    rows = (part.renumbered(part.camera, new) for new, old in enumerate(labels) for part in problem.of_label(old))
+    held = frozenset(range(len(state.cameras))) - moving
+    inside = replace(state, trajectories=tuple(state.trajectories[label] for label in labels))
+    _, found, _ = adjust(replace(problem, rows=tuple(rows), held=held), inside, iterations=12, rounds=2, coarse=True)
+    trajectories = list(state.trajectories)
+    for label, path in zip(labels, found.trajectories, strict=True):
+        trajectories[label] = path
+    return replace(found, trajectories=tuple(trajectories))
 
 
 def _subsampled(problem: Problem, state: AdjustmentState) -> Problem:
@@ -520,8 +554,7 @@ def inlier_share(reconstruction: Reconstruction, name: str) -> tuple[float, int]
     sigma = min(float(state.sigma[number]), sigma_limit(state, number))
     norms = [
         residual_norms(rows, reconstruction.state.cameras[number], reconstruction.state.trajectories[rows.label])
-        for rows in reconstruction.problem.rows
-        if rows.camera == number
+        for rows in reconstruction.problem.of_camera(number)
     ]
     values = np.concatenate(norms) if norms else np.zeros(0)
     values = values[np.isfinite(values)]

@@ -24,6 +24,8 @@ a lens that was not measured also the principal point 11, 12, k2 13, k3 14, log 
 OFFSET, RATE, FOCAL, K1, READOUT, CENTRE, K2, K3, ASPECT, P1 = 6, 7, 8, 9, 10, 11, 13, 14, 15, 16  # columns of a camera
 CRYSTAL_RATE_STD = 1.4e-4
 """Prior std of one crystal's rate against another's: each is within 100 ppm."""
+LARGE_NETWORK = 32
+"""Cameras above which a network is a chain rather than a room."""
 GIVEN_PARAMETERS = 11
 """Columns of a camera with given intrinsics; the others are never free."""
 
@@ -232,7 +234,7 @@ class Problem:
     readout_given: by camera, whether its readout was given, so that the rows' times are already corrected; () = none
     was. lens_tolerances: by camera, priors for given lenses that are estimated all the same; () = they are fixed.
     crystal_rates: by camera, whether its rate differs from the reference's only as two crystals do
-    (`CRYSTAL_RATE_STD`); () = not decided.
+    (`CRYSTAL_RATE_STD`); () = not decided. held: cameras of which nothing is free; any of them fix the gauge.
     """
 
     rows: tuple[TrackObservations, ...]
@@ -244,6 +246,7 @@ class Problem:
     readout_given: tuple[bool, ...] = ()
     lens_tolerances: tuple[LensPrior, ...] = ()
     crystal_rates: tuple[bool, ...] = ()
+    held: frozenset[int] = frozenset()
 
     @cached_property
     def by_camera(self) -> dict[int, tuple[TrackObservations, ...]]:
@@ -289,7 +292,7 @@ class Problem:
     def free_columns(self) -> Ints:
         """Indices of the free camera parameters in the stacked vector of CAMERA_PARAMETERS each."""
         columns: list[int] = []
-        for camera in range(len(self.nominal)):
+        for camera in (one for one in range(len(self.nominal)) if one not in self.held):
             base = camera * CAMERA_PARAMETERS
             if self.free_parameters.pose:
                 columns += range(base, base + 6)

@@ -17,7 +17,6 @@ from hub.calibration.given_values import refuted_lens
 from hub.calibration.self_calibration import MAX_FOCAL_STD
 from hub.sync.hypothesis import PairSolution
 from protocols.core.acceptance import AcceptanceTest, PrecisionTest, first_failure
-from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration
 
 _MIN_INLIER_SHARE = 0.5  # share of a camera's rows that must fit the trajectory
@@ -205,9 +204,9 @@ def _focal_lengths(reconstruction: Reconstruction, found: cov.Covariance) -> Cam
 def _precision(reconstruction: Reconstruction, found: cov.Covariance) -> CameraTests:
     """Precision of each camera's orientation and clock relative to the camera to which they are known best."""
     problem, state = reconstruction.problem, reconstruction.state
-    rotations = _best(cov.relative_rotation_stds(found, state))
-    shared = not problem.free_parameters.clock
-    clocks = np.zeros_like(rotations) if shared else _best(cov.relative_clock_stds(found, problem, state))
+    rotations, clocks = cov.smallest_relative_stds(found, problem, state)
+    if not problem.free_parameters.clock:
+        clocks = np.zeros_like(rotations)
     only = "the common motion determines its"
     return {
         name: [
@@ -230,13 +229,6 @@ def _precision(reconstruction: Reconstruction, found: cov.Covariance) -> CameraT
         ]
         for name, rotation, clock in zip(reconstruction.names, rotations, clocks, strict=True)
     }
-
-
-def _best(between: Floats) -> Floats:
-    """(n,) the smallest of each camera's values (n, n) with another one."""
-    between = between.copy()
-    np.fill_diagonal(between, np.inf)
-    return np.asarray(between.min(axis=1))
 
 
 def _lag_conflicts(reconstruction: Reconstruction, pairs: Iterable[PairSolution]) -> CameraTests:

@@ -12,7 +12,7 @@ from hub.bundle.initialisation import Reconstruction, sigma_limit
 from hub.bundle.noise.correlated_noise import refit_with_correlated_noise
 from hub.bundle.noise.noise_scale import correlation_inflation
 from hub.bundle.noise.timestamp_jitter import estimate_frame_times
-from hub.bundle.problem import AdjustmentState, ClockStep, Problem
+from hub.bundle.problem import LARGE_NETWORK, AdjustmentState, ClockStep, Problem
 from hub.bundle.residuals import residual_norms
 from hub.calibration.acceptance import misfits, wrong_lens
 from hub.calibration.pairs.pair_network import Progress
@@ -142,7 +142,8 @@ def final_adjustment(
         step = None if lens is None else clock_steps.find_clock_step(problem, state)
         if lens is not None and (step is None or step.statistic < lens.statistic):
             return reconstruction  # the camera will be left out
-    problem, state, _ = adjust(problem, state, rounds=2 if warm else 4, progress=lambda text: report(text, 0.75))
+    rounds = 2 if warm or len(state.cameras) > LARGE_NETWORK else 4
+    problem, state, _ = adjust(problem, state, rounds=rounds, progress=lambda text: report(text, 0.75))
     if not (warm and online):
         even = problem, state
         problem, state = _with_fewer_steps(even, _with_clock_steps(*even))

@@ -146,7 +146,7 @@ def calibrate(
                 warnings = tuple(move.warning(name) for name, move in moves.items())
                 return replace(found, warnings=(*found.warnings, *warnings))
         report("covariances", 0.95)
-        return assemble_calibration(rig, solution, refine_lenses=refine_lenses)
+        return assemble_calibration(rig, solution, refine_lenses=refine_lenses, online=online)
     except Refused as refusal:
         if may_move and (found := _between_settings(prepared.cameras, observations, again)):
             return found

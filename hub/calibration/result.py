@@ -24,7 +24,7 @@ from hub.bundle.model_comparison import REFUTED_SIGMA
 from hub.bundle.noise.noise_scale import rescale_noise
 from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
 from hub.bundle.preprocessing import PreparedSession
-from hub.bundle.problem import CRYSTAL_RATE_STD, FOCAL, READOUT, AdjustmentState, Problem
+from hub.bundle.problem import CRYSTAL_RATE_STD, FOCAL, LARGE_NETWORK, READOUT, AdjustmentState, Problem
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
@@ -56,12 +56,17 @@ _MAX_SAMPLES = 4_000_000
 
 
 def assemble_calibration(
-    rig: Rig, solution: Solution, published: Calibration | None = None, refine_lenses: bool = False
+    rig: Rig,
+    solution: Solution,
+    published: Calibration | None = None,
+    refine_lenses: bool = False,
+    online: bool = False,
 ) -> Calibration:
     """The calibration in the rig's world frame and units, on the reference camera's clock.
 
     published: an earlier calibration of the same cameras, whose world and scale are kept where the rig fixes none.
-    refine_lenses: whether measured lenses were free to change.
+    refine_lenses: whether measured lenses were free to change. online: of a recording that goes on; a large network's
+    lenses are not tested one by one then, as they are not in later answers, which have ``published`` ones.
     """
     reconstruction = solution.reconstruction
     # The rig's order decides which camera is the reference and the first baseline.
@@ -171,6 +176,7 @@ def assemble_calibration(
         )
         for i, name in enumerate(names)
     }
+    tests_lenses = published is None and not (online and len(names) > LARGE_NETWORK)
     tables = _tables(rig, solution.prepared, names, reconstruction.labels, problem, state, covariance, reference)
     return Calibration(
         cameras=cameras,
@@ -190,7 +196,7 @@ def assemble_calibration(
         + _unused_lengths(rig, names, reconstruction.labels)
         + gauge.warnings
         + _estimated_lenses(rig, cameras)
-        + (refuted_lens_warnings(names, problem, state, refine_lenses) if published is None else ())
+        + (refuted_lens_warnings(names, problem, state, refine_lenses) if tests_lenses else ())
         + _other_frame_rates(rig, cameras, names[reference])
         + _rejected_rows(names, problem, state)
         + _estimated_readouts(cameras)

@@ -90,7 +90,7 @@ def overlaps(observations: Observations, arrivals: Arrivals) -> OverlapMeter:
 
 def offline(cameras: int, hubs: int, seconds: float, fps: float, seed: int) -> None:
     """One row of the table."""
-    rig, observations, arrivals, true = street(seed, cameras, seconds, fps)
+    rig, observations, arrivals, true, _ = street(seed, cameras, seconds, fps)
     pairs = overlaps(observations, arrivals).pairs()
     groups = split(pairs, rig.cameras, [f"hub{number}" for number in range(hubs)], {})
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), max_tasks_per_child=1) as pool:
@@ -251,7 +251,7 @@ class Site:
 
 def live(cameras: int, hubs: int, seconds: float, fps: float, seed: int) -> None:
     """Print what hubs over a router make of a street, and of the death of two of them."""
-    rig, observations, arrivals, true = street(seed, cameras, seconds + 300.0, fps, reach=4.0, stretch=4.0)
+    rig, observations, arrivals, true, _ = street(seed, cameras, seconds + 300.0, fps, reach=4.0, stretch=4.0)
     names = [f"hub{number}" for number in range(hubs)]
     with ExitStack() as stack:
         site = Site(

@@ -14,8 +14,10 @@ import sys
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+
+import numpy as np
 
 from deploy.offline.exchange.session_log import _observation_messages, camera_info
 from hub.calibration.pipeline import calibrate
@@ -25,8 +27,12 @@ from hub.live.live_hub import LiveHub, LiveSettings
 from hub.live.solver import SolverAnswer, SolverJob
 from hub.live.worker import WorkerSolver
 from protocols.bus.transport.inbox import Inbox
-from protocols.core.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS, CameraTime, TimeMap
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
+from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 from protocols.topics import OBSERVATION
@@ -67,8 +73,39 @@ class _OwnCore(WorkerSolver):
         return answer
 
 
-def live(rig: Rig, observations: Observations, arrivals: Mapping[str, ExternalClockPrior], without: str) -> None:
-    """Print what a hub makes of a session that is streamed to it, through its queue and gate."""
+def accuracy(found: Calibration, poses: Mapping[str, Pose], clocks: Mapping[str, TimeMap]) -> str:
+    """Errors of lags, rotations and positions, relative to the first camera and baseline, rms, and over their stds."""
+    first, second = list(found.cameras)[:2]
+    world, base = poses[first], clocks[found.reference]
+    scale = float(np.linalg.norm(poses[second].position - world.position))
+    lags, rotations, positions = list[float](), list[float](), list[Floats]()
+    for name, camera in found.cameras.items():
+        relative = camera.pose.rotation @ world.rotation @ poses[name].rotation.T
+        rotations.append(float(np.linalg.norm(so3.log(relative))))
+        true = world.rotation @ (poses[name].position - world.position) / scale
+        if name not in (first, second, found.reference):
+            positions.append((camera.pose.position - true) / camera.position_std)
+            at = camera.lag_time
+            seen = float(
+                base.reference_from_camera(CameraTime(float(camera.time_map.reference_from_camera(CameraTime(at)))))
+            )
+            lags.append(seen - float(clocks[name].reference_from_camera(CameraTime(at))))
+    stds = [camera.lag_std for name, camera in found.cameras.items() if name not in (first, second, found.reference)]
+    rms = [float(np.sqrt(np.mean(np.square(one)))) for one in (lags, np.array(lags) / stds, rotations, positions)]
+    return (
+        f"rms errors: lag {1e3 * rms[0]:.2f} ms ({rms[1]:.2f} stds), rotation {np.rad2deg(rms[2]):.3f}°, "
+        f"position {rms[3]:.2f} stds"
+    )
+
+
+def live(
+    rig: Rig,
+    observations: Observations,
+    arrivals: Mapping[str, ExternalClockPrior],
+    without: str,
+    score: Callable[[Calibration], str],
+) -> None:
+    """Print what a hub makes of a session that is streamed to it, through its queue and gate. score: of an answer."""
     frames = []
     for name, camera in rig.cameras.items():
         offset = arrivals[name].unix_minus_camera
@@ -112,8 +149,9 @@ def live(rig: Rig, observations: Observations, arrivals: Mapping[str, ExternalCl
             spent, began = 0.0, time.process_time()
         for one in messages:
             encode(one)
-            if isinstance(one, pb.Calibration) and one.status == "solved":
-                print(f"{now - start:7.1f} s: {len(one.cameras)} cameras, {len(one.refused)} not", flush=True)
+            if isinstance(one, pb.Calibration) and one.status == "solved" and hub.calibration is not None:
+                found = f"{len(one.cameras)} cameras, {len(one.refused)} not"
+                print(f"{now - start:7.1f} s: {found}; {score(hub.calibration)}", flush=True)
         round_s.append(time.process_time() - began)
         spent += round_s[-1]
     solver_mb = 0.0 if solver._pid is None else resident_mb(solver._pid.result())
@@ -131,9 +169,9 @@ def main() -> int:
     parser.add_argument("--live", action="store_true")
     parser.add_argument("--without", choices=("tracks", "smoothing"), help="of what a hub makes live")
     options = parser.parse_args()
-    rig, observations, arrivals, _ = street(options.seed, options.cameras, options.seconds, options.fps)
+    rig, observations, arrivals, poses, clocks = street(options.seed, options.cameras, options.seconds, options.fps)
     if options.live:
-        live(rig, observations, arrivals, options.without)
+        live(rig, observations, arrivals, options.without, lambda found: accuracy(found, poses, clocks))
         return 0
     began, marks = time.process_time(), {}
 
@@ -144,7 +182,8 @@ def main() -> int:
     print(
         f"{options.cameras} cameras, {options.seconds:g} s: {len(found.pairs)} pairs; "
         f"{len(found.cameras)} placed, {len(found.refused)} refused; CPU {marks['placing']:.1f} s until placed, "
-        f"{marks['covariances']:.1f} s adjusted, {time.process_time() - began:.1f} s in all"
+        f"{marks['covariances']:.1f} s adjusted, {time.process_time() - began:.1f} s in all\n"
+        f"{accuracy(found, poses, clocks)}"
     )
     return 0
 

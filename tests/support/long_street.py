@@ -26,8 +26,8 @@ def street(
     delay: float = 0.05,
     reach: float = _REACH_M,
     stretch: float = _STRETCH_M,
-) -> tuple[Rig, Observations, dict[str, ExternalClockPrior], dict[str, Pose]]:
-    """Rig, rows, priors by times of arrival (up to ``delay`` off) and true poses, a pure function of the arguments.
+) -> tuple[Rig, Observations, dict[str, ExternalClockPrior], dict[str, Pose], dict[str, TimeMap]]:
+    """Rig, rows, priors by times of arrival (up to ``delay`` off), true poses and clocks, a function of the arguments.
 
     reach: how far along the street a camera sees; stretch: what a target is at home in [m]: where both are short, a
     camera always sees some targets move, and a film of a few seconds is enough.
@@ -69,4 +69,4 @@ def street(
                 values.append(kept)
     frame, time, seen = (np.concatenate(values) for values in rows[2:])
     found = gather_tracks(rows[0], rows[1], frame, time, seen, np.full(len(time), np.nan))
-    return Rig(table), found, arrivals, poses
+    return Rig(table), found, arrivals, poses, clocks

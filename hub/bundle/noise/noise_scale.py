@@ -7,6 +7,7 @@ than the number of residuals.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -19,13 +20,21 @@ from hub.bundle.covariance import Covariance, covariance, inverse_blocks
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
     CAMERA_PARAMETERS,
+    LARGE_NETWORK,
     OFFSET,
     AdjustmentState,
     FreeParameters,
     Problem,
     TrackObservations,
 )
-from hub.bundle.residuals import linearise, predict, residual_norms
+from hub.bundle.residuals import (
+    StackedTrajectories,
+    evaluate_labels,
+    jacobians,
+    linearise,
+    predict,
+    residual_norms,
+)
 from hub.bundle.smoothness_prior import SmoothnessPrior
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry.types import Floats
@@ -79,7 +88,9 @@ def rescale_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPri
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
         return state
     found, none = covariance(problem, state, prior, longest=True), np.zeros(len(state.cameras))
-    noise = _over_redundancy(residual_std(problem, state), problem, state, found, none, _MAX_ROWS)
+    # A camera's redundancy follows from few rows of it, and many cameras that see a label cost each of them more.
+    most_rows = _MAX_ROWS if len(none) <= LARGE_NETWORK else _MAX_ROWS_IN_ROUNDS
+    noise = _over_redundancy(residual_std(problem, state), problem, state, found, none, most_rows)
     modelled = [modelled_inflation(problem, state, camera) for camera in range(len(state.cameras))]
     return replace(state, sigma=noise * np.sqrt(np.maximum(correlation_inflation(problem, state), modelled)))
 
@@ -89,13 +100,17 @@ def _over_redundancy(
 ) -> Floats:
     """Noise (cameras,) of residual stds, given how many coordinates of each camera are absorbed beside those found."""
     coordinates, absorbed = np.zeros(len(noise)), absorbed.copy()
-    for label, parts in problem.by_label.items():
-        seeing = found.a_inv_b.parts[label][1]
-        known = found.free.submatrix(seeing) if len(found.columns) else np.zeros((0, 0))
-        for rows in parts:
-            coordinates[rows.camera] += 2.0 * float(np.count_nonzero(rows.use))
-            share = -(-most_rows // len(problem.of_camera(rows.camera)))
-            absorbed[rows.camera] += _hat_matrix_trace(problem, state, found, known, rows, share)
+    paths, nothing = StackedTrajectories.of(state.trajectories), np.zeros((0, 0))
+    # The cameras' share differs from label to label.
+    groups = problem.by_label.values() if len(found.columns) else problem.by_camera.values()
+    for group in groups:
+        seeing = found.a_inv_b.parts[group[0].label][1]
+        known = found.free.submatrix(seeing) if len(found.columns) else nothing
+        for parts in [(rows,) for rows in group] if len(found.columns) else [group]:
+            camera = parts[0].camera
+            coordinates[camera] += 2.0 * sum(int(np.count_nonzero(rows.use)) for rows in parts)
+            share = -(-most_rows // len(problem.of_camera(camera)))
+            absorbed[camera] += _hat_matrix_trace(problem, state, paths, found, known, parts, share)
     degrees = np.maximum(coordinates - absorbed, 1.0)
     squares = np.square(noise) * np.maximum(coordinates, 1.0)
     common = float(squares.sum() / degrees.sum())
@@ -145,41 +160,53 @@ def _pooled_noise(problem: Problem, state: AdjustmentState) -> float:
 def _hat_matrix_trace(
     problem: Problem,
     state: AdjustmentState,
+    paths: StackedTrajectories,
     found: Covariance,
     known: Floats,
-    rows: TrackObservations,
+    parts: Sequence[TrackObservations],
     most_rows: int,
 ) -> float:
     """Trace of the hat matrix over the rows: how many of their residual coordinates the fit absorbs.
 
-    known: covariance of the parameters of the cameras that see the label.
+    parts: rows of one camera; of one label where camera parameters are among the found ones. known: covariance of the
+    parameters of the cameras that see that label. most_rows: of each part, evenly spaced.
     """
-    used = np.flatnonzero(rows.use)
-    if not len(used):
+    picked, times = list[TrackObservations](), list[Floats]()
+    for rows in parts:
+        used = np.flatnonzero(rows.use)
+        if len(used):
+            pick = used[np.unique(np.linspace(0, len(used) - 1, min(len(used), most_rows)).astype(np.int64))]
+            use = np.zeros_like(rows.use)
+            use[pick] = True
+            picked.append(rows.using(use))
+            times.append(np.full(len(pick), len(used) / len(pick)))
+    if not picked:
         return 0.0
-    pick = used[np.unique(np.linspace(0, len(used) - 1, min(len(used), most_rows)).astype(np.int64))]
-    use = np.zeros_like(rows.use)
-    use[pick] = True
-    rows = rows.using(use)
+    number = picked[0].camera
     columns = CAMERA_PARAMETERS if len(found.columns) else 0
-    line = linearise(rows, state.cameras[rows.camera], state.trajectories[rows.label], columns)
-    root = (np.where(line.valid, 1.0 / rows.used_relative_std, 0.0) / float(state.sigma[rows.camera]))[:, None, None]
-    rows_of_label, seeing, by_cameras = found.a_inv_b.parts[rows.label]
-    first = rows_of_label.start + 3 * line.index
-    inside = (first % BAND)[:, None] + np.arange(BAND)
-    blocks = found.blocks[(first // BAND)[:, None, None], inside[:, :, None], inside[:, None, :]]
+    seen = evaluate_labels(picked, state.cameras[number], paths)
+    jacobian = jacobians(seen, state.cameras[number], range(columns))
+    jacobian *= np.where(seen.valid, np.sqrt(seen.relative_information), 0.0) / float(state.sigma[number])
+    jacobian = jacobian.transpose(2, 0, 1)
     # By the four control points of a row, (n, 2, 12).
-    by_path = (line.weights[:, None, :, None] * (root * line.point_jacobian)[:, :, None, :]).reshape(-1, 2, BAND)
-    leverage = (by_path @ blocks * by_path).sum(axis=(1, 2))
+    by_path = (seen.weights[:, None, :, None] * jacobian[:, :, None, :3]).reshape(-1, 2, BAND)
+    block, inside = np.divmod(3 * seen.index, BAND)
+    leverage = np.zeros(len(by_path))
+    for first in range(0, BAND, 3):
+        some = np.flatnonzero(inside == first)
+        of_some, blocks = by_path[some], found.blocks[block[some], first : first + BAND, first : first + BAND]
+        leverage[some] = (of_some @ blocks * of_some).sum(axis=(1, 2))
     if columns:
-        shift = -by_path @ by_cameras[3 * line.index[:, None] + np.arange(BAND)]
+        rows_of_label, seeing, by_cameras = found.a_inv_b.parts[picked[0].label]
+        at = 3 * seen.index[:, None] - rows_of_label.start + np.arange(BAND)
+        shift = -by_path @ by_cameras[at]
         parameters = problem.free_columns[seeing]
-        own = np.flatnonzero(parameters // CAMERA_PARAMETERS == rows.camera)
-        shift[:, :, own] += root * line.camera_jacobian[:, :, parameters[own] % CAMERA_PARAMETERS]
+        own = np.flatnonzero(parameters // CAMERA_PARAMETERS == number)
+        shift[:, :, own] += jacobian[:, :, 3 + parameters[own] % CAMERA_PARAMETERS]
         shift = shift.reshape(-1, len(seeing))
-        leverage += (shift @ known * shift).reshape(len(pick), -1).sum(axis=1)
+        leverage += (shift @ known * shift).reshape(len(by_path), -1).sum(axis=1)
     # A coordinate has 1 at most; where a path passes through the camera's plane, rounding made it thousands.
-    return float(np.minimum(leverage, 2.0).sum()) * len(used) / len(pick)
+    return float(np.minimum(leverage, 2.0) @ np.concatenate(times))
 
 
 def modelled_inflation(problem: Problem, state: AdjustmentState, camera: int) -> float:

@@ -228,7 +228,7 @@ def _observed_times(problem: Problem, state: AdjustmentState) -> dict[int, list[
 def _velocity(rows: TrackObservations, state: AdjustmentState) -> tuple[LinearisedResiduals, Floats]:
     """All rows linearised, and their velocities (n, 2) [px/s]."""
     every = rows.using(np.ones(len(rows.time), dtype=np.bool_))
-    line = linearise(every, state.cameras[rows.camera], state.trajectories[rows.label])
+    line = linearise(every, state.cameras[rows.camera], state.trajectories[rows.label], OFFSET + 1)
     return line, line.camera_jacobian[:, :, OFFSET] * state.cameras[rows.camera].rate
 
 

@@ -68,6 +68,7 @@ def solve_pairs(
     names = prepared.names
     todo = candidate_pairs(prepared, arrivals)
     is_large = len(names) > _SMALL_NETWORK and not prepared.shared_clock
+    is_vast = len(names) > LARGE_NETWORK
     pairs: dict[tuple[str, str], PairSolution] = {}
     unguided: dict[tuple[str, str], PairSolution] = {}
     synchronised, cache = SynchronisedGroups(), TrackCache()
@@ -84,7 +85,7 @@ def solve_pairs(
             continue
         done = len(pairs)
         report(f"pair {a}–{b}", 0.05 + 0.5 * done / max(len(todo), 1))
-        if arrivals and len(names) > LARGE_NETWORK and synchronised.has_enough(a, b):
+        if arrivals and is_vast and synchronised.has_enough(a, b):
             pairs[a, b] = PairSolution(a, b, "not searched: both cameras are in enough solved pairs")
             continue
         predicted_lag = None if prepared.shared_clock else synchronised.lag(prepared, a, b)
@@ -92,7 +93,7 @@ def solve_pairs(
         if expected is not None:
             near = PairSettings(predicted_lag_window=expected[1])
             solution = _solve(prepared, (a, b), known, predicted_lag=expected[0], settings=near, cache=cache)
-            if not solution.solved or _agrees(solution, predicted_lag):
+            if not solution.solved or _agrees(solution, predicted_lag) or (is_vast and _is_certain(solution)):
                 pairs[a, b] = solution
                 synchronised.add(solution)
                 continue
@@ -236,6 +237,12 @@ def _agrees(solution: PairSolution, predicted_lag: float | None) -> bool:
     if solution.fit is None or predicted_lag is None:
         return False
     return abs(solution.fit.lag - predicted_lag) < PairSettings().predicted_lag_window
+
+
+def _is_certain(solution: PairSolution) -> bool:
+    """Whether no chance makes a solved pair fit at its lag; without a distribution of chance it fits for 8 s."""
+    chance = None if solution.fit is None else solution.fit.log10_false_alarm
+    return chance is None or chance < PairSettings().certain_lag_log10_false_alarm
 
 
 def _has_long_overlap(solution: PairSolution) -> bool:

@@ -12,7 +12,7 @@ from tests.support.long_street import street
 
 
 def test_two_hubs_give_one_answer_and_one_takes_over(tmp_path: Path) -> None:
-    rig, observations, arrivals, true = street(7, 6, 150.0, 10.0, reach=4.0, stretch=4.0)
+    rig, observations, arrivals, true, _ = street(7, 6, 150.0, 10.0, reach=4.0, stretch=4.0)
     with ExitStack() as stack:
         site = Site(stack, tmp_path, ["a", "b"], (rig, observations, arrivals))
         assert site.wait(lambda: len(site.shards) == 2, 60.0) < 60.0

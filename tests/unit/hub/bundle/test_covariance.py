@@ -25,6 +25,7 @@ from hub.calibration.pipeline import calibrate
 from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
 from tests.support.rigs import looking_at, random_lens, random_path, random_poses, simulate
+from tests.unit.hub.bundle.test_adjustment import simulated_problem
 
 RUNS, SECONDS = 40, 12.0
 
@@ -219,3 +220,17 @@ def test_the_smoothness_of_a_path_does_not_hold_its_depth() -> None:
         for one in (prior, replace(prior, weights=tuple(1e-4 * weight for weight in prior.weights)))
     )
     assert with_prior > 0.6 * without
+
+
+def test_of_a_large_network_stds_are_among_cameras_that_share_labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All against all takes the whole covariance, of a thousand cameras a tenth of a gigabyte and seconds."""
+    problem, state, prior = simulated_problem(4, lens=False)
+    found = cov.covariance(problem, state, prior)
+    every = cov.smallest_relative_stds(found, problem, state)
+    monkeypatch.setattr(cov, "LARGE_NETWORK", 2)
+    np.testing.assert_allclose(cov.smallest_relative_stds(found, problem, state), every)
+    apart = replace(problem, rows=tuple(part for part in problem.rows if part.camera != 0 or part.label))
+    apart = replace(apart, rows=tuple(part for part in apart.rows if part.camera != 2 or not part.label))
+    rotations, _ = cov.smallest_relative_stds(found, apart, state)
+    between = cov.relative_rotation_stds(found, state)
+    np.testing.assert_allclose(rotations, [between[0, 1], min(between[0, 1], between[1, 2]), between[1, 2]])

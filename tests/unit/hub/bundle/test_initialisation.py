@@ -12,6 +12,7 @@ import pytest
 
 from hub.bundle import initialisation
 from hub.bundle.initialisation import CameraInput, _subsampled, knot_spacing
+from hub.bundle.problem import AdjustmentState, Problem
 from hub.calibration.pipeline import calibrate
 from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from protocols.geometry.camera import Intrinsics
@@ -90,3 +91,34 @@ def test_a_path_of_few_frames_a_knot_has_denser_knots(fps: float, share: float) 
     cameras = [CameraInput(name, lens, {"joint": track}) for name in "abcd"]
     assert knot_spacing(cameras, "joint") == share * track.basis.spacing
     assert knot_spacing(cameras[:2], "joint") == track.basis.spacing  # two have too few rows for so many knots
+
+
+def test_while_a_large_network_grows_only_new_cameras_are_adjusted() -> None:
+    """A street of a thousand was adjusted from its first camera to its last each time that it had grown by a third."""
+    problem, state, _ = simulated_problem(2, lens=False, perturbation=1e-3)
+    found = initialisation._adjusted_among(problem, replace(state, sigma=np.full(3, 2.0)), {1})
+    assert found.cameras[0] is state.cameras[0]
+    assert found.cameras[2] is state.cameras[2]
+    assert np.linalg.norm(found.cameras[1].pose.position - state.cameras[1].pose.position) > 1e-5
+    assert all(
+        after.basis is before.basis for after, before in zip(found.trajectories, state.trajectories, strict=True)
+    )
+
+
+def test_several_cameras_are_placed_at_once_where_a_network_is_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each camera of a street was placed by itself, which triangulated what it saw once more for each of them."""
+    session, made = simulate(4, 7, 30.0), []
+    one = calibrate(session.rig, session.observations())
+    monkeypatch.setattr(initialisation, "LARGE_NETWORK", 2)
+    adjust = initialisation._adjusted_among
+
+    def counted(problem: Problem, state: AdjustmentState, moving: set[int]) -> AdjustmentState:
+        made.append(len(moving))
+        return adjust(problem, state, moving)
+
+    monkeypatch.setattr(initialisation, "_adjusted_among", counted)
+    both = calibrate(session.rig, session.observations())
+    assert list(both.cameras) == list(one.cameras)
+    assert len(made) < len(one.cameras) - 2, "fewer adjustments than cameras that were added"
+    for name, camera in both.cameras.items():
+        np.testing.assert_allclose(camera.pose.position, one.cameras[name].pose.position, atol=1e-3)

@@ -11,6 +11,7 @@ from hub.bundle.adjustment import adjust
 from hub.bundle.covariance import covariance
 from hub.bundle.noise.noise_scale import _hat_matrix_trace, _serial_inflation, rescale_noise, residual_std
 from hub.bundle.normal_equations import build_system
+from hub.bundle.residuals import StackedTrajectories
 from hub.calibration.pipeline import calibrate
 from protocols.geometry.types import Floats
 from tests.support.rigs import simulate
@@ -21,7 +22,10 @@ def test_the_absorbed_residuals_are_the_trace_of_the_dense_hat_matrix() -> None:
     problem, state, prior = simulated_problem(3)
     found = covariance(problem, state, prior)
     known = {label: found.free.submatrix(found.a_inv_b.parts[label][1]) for label in problem.by_label}
-    mine = sum(_hat_matrix_trace(problem, state, found, known[rows.label], rows, 2000) for rows in problem.rows)
+    paths = StackedTrajectories.of(state.trajectories)
+    mine = sum(
+        _hat_matrix_trace(problem, state, paths, found, known[rows.label], [rows], 2000) for rows in problem.rows
+    )
     whole = dense(build_system(problem, state, prior, robust=False)[0])
     priors = dense(build_system(replace(problem, rows=()), state, prior, robust=False)[0])
     scale = 1.0 / np.sqrt(np.diag(whole))  # one tolerance for metres, radians and seconds

@@ -20,7 +20,7 @@ from tests.support.long_street import street
 
 def test_of_a_long_street_only_pairs_with_common_motion_are_tried() -> None:
     """Each pair of all cameras had a coarse scan: of a thousand 500,000, half an hour before the first answer."""
-    rig, observations, arrivals, _ = street(3, cameras=60, seconds=12.0)
+    rig, observations, arrivals, *_ = street(3, cameras=60, seconds=12.0)
     prepared = prepare(rig, observations)
     chosen = set(candidate_pairs(prepared, arrivals))
     assert 2 * 60 < len(chosen) < 12 * 60
@@ -40,7 +40,7 @@ def test_of_a_long_street_only_pairs_with_common_motion_are_tried() -> None:
 
 
 def test_small_networks_and_unknown_clocks_have_all_their_pairs() -> None:
-    rig, observations, arrivals, _ = street(3, cameras=LARGE_NETWORK + 6, seconds=8.0)
+    rig, observations, arrivals, *_ = street(3, cameras=LARGE_NETWORK + 6, seconds=8.0)
     prepared = prepare(rig, observations)
     names, every = prepared.names, len(prepared.names) * (len(prepared.names) - 1) // 2
     assert len(candidate_pairs(prepared, None)) == every
@@ -53,7 +53,7 @@ def test_small_networks_and_unknown_clocks_have_all_their_pairs() -> None:
 def test_the_chosen_pairs_connect_all_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hub.calibration.pairs.pair_overlap.LARGE_NETWORK", 4)
     monkeypatch.setattr(pair_network, "LARGE_NETWORK", 4)
-    rig, observations, arrivals, _ = street(5, cameras=9, seconds=40.0)
+    rig, observations, arrivals, *_ = street(5, cameras=9, seconds=40.0)
     solve, searches = pair_network._solve, Counter[tuple[str, str]]()
 
     def counted(prepared: PreparedSession, names: tuple[str, str], *rest: Any, **more: Any) -> PairSolution:
@@ -66,4 +66,4 @@ def test_the_chosen_pairs_connect_all_cameras(monkeypatch: pytest.MonkeyPatch) -
     assert len(connected_components(prepared.names, solved)[0]) == 9
     assert len(solved) < 9 * 8 // 2
     twice = [names for names, count in searches.items() if count > 1]
-    assert len(twice) <= 8 < len(solved), "near the times of arrival and over all lags, only where it connects a camera"
+    assert not twice, "near the times of arrival; over all lags only where chance may fit there"

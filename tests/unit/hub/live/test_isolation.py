@@ -26,11 +26,13 @@ from protocols.core.ranges import MAX_CAMERAS
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.builder import SessionBuilder
+from protocols.session import builder
+from protocols.session.builder import SessionBuilder, rig_camera_from_info
 from protocols.session.calibration import CameraCalibration
 from protocols.session.rig import Rig, RigCamera
 from protocols.topics import CALIBRATION, OBSERVATION, STATUS
 from protocols.validation.codec import decode, encode
+from tests.support.samples import camera_info
 
 
 def frame(camera: str, number: int, points: int = 1, period_ns: int = 33_000_000, **fields: Any) -> pb.Observation:
@@ -311,3 +313,17 @@ def test_a_thousand_cameras_do_not_make_the_status_inadmissible() -> None:
     assert gauges["frame_age_s.cam900"] == 4.0, "of so many cameras the worst are named"
     assert view.headline().startswith("degraded: 1000 cameras")
     assert not any("no hub" in step for step in view.next_steps())
+
+
+def test_the_cameras_of_a_job_are_made_when_they_introduce_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand of them made at once, with each job, took a round of the loop that serves the bus."""
+    sessions, made = SessionBuilder(window_s=60.0), []
+    monkeypatch.setattr(builder, "rig_camera_from_info", lambda info: made.append(info) or rig_camera_from_info(info))
+    for name in ("a", "b"):
+        sessions.handle(camera_info(name))
+        sessions.handle(frame(name, 1))
+    sessions.handle(camera_info("a"))
+    assert sessions.build()[0].cameras.keys() == sessions.build()[0].cameras.keys() == {"a", "b"}
+    assert len(made) == 2
+    sessions.handle(pb.CameraInfo(schema_version=1, camera="a", width=320, height=240, fps=10.0))
+    assert sessions.build()[0].cameras["a"].size == (320, 240)
