@@ -432,6 +432,7 @@ def _cached_detections(session: Path, camera: str, entry: Any, key: str) -> Vide
                 "rows": tuple(text.splitlines()[1:]),
                 "size": (int(size[0]), int(size[1])),
                 "span": (float(span[0]), float(span[1])),
+                "warnings": tuple(map(str, values["warnings"])),
             }
         )
     except (OSError, KeyError, TypeError, ValueError, IndexError):

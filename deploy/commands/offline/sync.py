@@ -65,7 +65,12 @@ def sync(
     if not has_pyav():
         raise InputError("`sync` needs PyAV, which is not installed", remedy="pip install 'syncline[video]'")
     listed, warnings = list_videos(folder)
-    found = {video.camera: VideoReader(video.path) for video in listed if _readable(video.path)}
+    found = {}
+    for video in listed:
+        try:
+            found[video.camera] = VideoReader(video.path)
+        except InputError as error:
+            warnings.append(f"{video.path.name}: {error.what}; left out")
     if calibration is None:
         calibration = _estimate(folder, out / "timing", json)
     reference, known, stds = syncing.read_time_maps(calibration, found)
@@ -96,7 +101,7 @@ def sync(
                 target_or_none = target if videos == "retime" else None
                 done[name] = syncing.retime(film, maps[name], grid, target_or_none, rate, report)
             before += film.info.frames
-            warnings += [f"{film.path.name}: {text}" for text in _reader_warnings(film)]
+            warnings += [f"{film.path.name}: {text}" for text in film.warnings]
     files = {file_in(out, f"{name}.csv"): syncing.times_text(video) for name, video in done.items()}
     if videos != "trim":
         files[out / "synchronised.csv"] = syncing.grid_text(grid, done, csv_cell)
@@ -129,16 +134,6 @@ def sync(
     return answer(document, [*lines, *closing_lines(warnings, written)], json)
 
 
-def _readable(path: Path) -> bool:
-    from edge.devices.playback.video_reader import VideoReader
-
-    try:
-        VideoReader(path)
-    except InputError:
-        return False
-    return True
-
-
 def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
     """Calibrate the videos as far as they allow; the file with their clocks. Raises Refused where there are none."""
     from deploy.offline.video_folder import SESSION, session_from_videos
@@ -162,11 +157,3 @@ def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
             raise
         return out / RESULT
     return out / CALIBRATION
-
-
-def _reader_warnings(film: object) -> list[str]:
-    from edge.devices.playback.video_reader import VideoReader
-
-    assert isinstance(film, VideoReader)
-    warnings = [f"{film.corrupt} frames could not be decoded and were skipped"] if film.corrupt else []
-    return warnings + ([f"{film.repaired} frames have no usable time stamp"] if film.repaired else [])

@@ -366,6 +366,16 @@ def test_videos_are_synchronised_triangulated_and_exported_to_every_format(
     assert len((tmp_path / "track.trc").read_text().splitlines()) > len(again)
 
 
+def test_a_video_that_cannot_be_read_is_left_out_of_the_synchronised_ones_with_a_word(
+    recorded: RecordedVideos, tmp_path: Path, capsys: Capture
+) -> None:
+    shutil.copytree(recorded.folder, tmp_path / "videos")
+    (tmp_path / "videos" / "cam0.mp4").write_bytes((recorded.folder / "cam0.mp4").read_bytes()[:3000])
+    arguments = ["sync", str(tmp_path / "videos"), "--calibration", str(recorded.out / "calibration.toml")]
+    assert run([*arguments, "--videos", "none", "--out", str(tmp_path / "out")]) == 0
+    assert "warning: cam0.mp4: no frame can be read from this file" in capsys.readouterr().out
+
+
 def test_two_cameras_without_lenses_are_synchronised_by_timing_alone(
     recorded: RecordedVideos, without_lenses: tuple[Path, Path, str], tmp_path: Path, capsys: Capture
 ) -> None:
