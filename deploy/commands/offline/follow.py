@@ -85,7 +85,7 @@ def follow(
         check_folder(crops)
         if kind != "person":
             raise InputError("--crops shows heads and torsos of people", remedy="leave it out for vehicles")
-    from deploy.evaluation.tracking_scores import parse_area, read_ground_truth, score_tracks
+    from deploy.evaluation.tracking_scores import parse_area, read_ground_truth, score_tracks, trackeval_metrics
     from deploy.offline.follow.calibration import read_given_calibration
     from deploy.offline.follow.crops import check_pictures, write_crops
     from deploy.offline.follow.report import follow_report
@@ -103,6 +103,7 @@ def follow(
             what = "the calibration has no metric scale, and matches are within 0.5 m"
             raise InputError(what, file=calibration, remedy="give the rig a distance, or leave out --truth")
         read_ground_truth(truth, None)  # reported before minutes of detection
+        trackeval_metrics()
     with progress_bar(f"reading {session.name}", quiet=json) as progress:
         source = read_follow_input(
             session,
