@@ -14,6 +14,8 @@ from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError
 from protocols.core.files import check_folder, write_together
 
+_SHORT_S = 0.5  # s: the last frame of a variable rate may last for longer than others
+
 if TYPE_CHECKING:
     from edge.uav.base import Telemetry
     from protocols.geometry.camera import Intrinsics
@@ -135,7 +137,9 @@ def track(
                 out / tracking.HYPOTHESES: tracking.hypotheses_text(rows),
             }
         )
-    if count and rows[-1].frame + 1 < count:
+    # Of containers that do not count their frames, the number is the duration by the highest rate.
+    ends = count / recording.info.fps - rows[-1].time if rate is None and counted is None else math.inf
+    if count and rows[-1].frame + 1 < count and ends > _SHORT_S:
         warnings.append(f"{video}: {rows[-1].frame + 1} of {count} frames could be decoded")
     if (
         model == "ground"

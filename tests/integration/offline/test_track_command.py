@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
+from tests.support.videos import write_video
 
 SIZE = (320, 240)
 FRAMES = 45
@@ -217,3 +218,17 @@ def test_telemetry_on_another_clock_or_in_other_units_is_named(
     printed = capsys.readouterr().out
     assert ("warning:" in printed) == bool(warning)
     assert warning in printed
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_a_variable_frame_rate_is_no_loss_of_frames(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], share: float
+) -> None:
+    """Matroska has no number of frames."""
+    images = [cv2.imread(str(file)) for file in sorted((recording / "pictures").iterdir())]
+    times = np.cumsum(np.tile([0.05, 0.1, 0.15], FRAMES // 3))
+    write_video(tmp_path / "a.mkv", images, times)
+    content = (tmp_path / "a.mkv").read_bytes()
+    (tmp_path / "a.mkv").write_bytes(content[: int(share * len(content))])
+    assert run(["track", str(tmp_path / "a.mkv"), "--target", TARGET, "--out", str(tmp_path / "out")]) == 0
+    assert ("frames could be decoded" in capsys.readouterr().out) == (share < 1.0)
