@@ -130,7 +130,7 @@ def follow(
         count = sum(len(message.detections) for message in source.observations)
         raise Refused(
             f"none of {count} detections made a track: no two cameras see a {kind} at one place for long enough; check "
-            "that the calibration is of these cameras, and their time offsets",
+            "that the calibration is of these cameras, its time offsets, and `up`",
             warnings=result.warnings,
         )
     times = [time_ns / NANOSECONDS for time_ns in source.times_ns]
