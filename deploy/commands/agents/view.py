@@ -130,7 +130,10 @@ def _recording(source: Path) -> Any:
     if source.suffix == ".toml" or (source.is_dir() and (source / "calibration.toml").exists()):
         return CalibrationRecording(source)
     if source.suffix == ".mcap" or (source.is_dir() and any(source.glob("*.mcap"))):
-        return LogRecording(source)
+        log = LogRecording(source)
+        if log.damage:
+            print(f"syncline: {source}: damaged: {log.damage}; only its intact part is shown", file=sys.stderr)
+        return log
     remedy = "name a .mcap log, a folder with calibration.toml, or an agent's .toml file"
     raise InputError("neither a log nor a calibration", file=source, remedy=remedy)
 

@@ -148,6 +148,8 @@ def track(
     ):
         needs = "metres, down the negative height above the ground, at which the target is 1.2 to 30 m long"
         warnings.append(f"{telemetry}: its positions were used in no frame: they must be north, east, down in {needs}")
+    if isinstance(recording, LoggedFlightImages) and recording.damage:
+        warnings.append(f"{video}: damaged: {recording.damage}; only its intact part was tracked")
     if recording.repaired:
         warnings.append(f"{video}: {recording.repaired} frames have no usable time stamp")
     scores = score(rows, truth, size) if truth is not None else None
