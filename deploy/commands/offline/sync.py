@@ -66,11 +66,11 @@ def sync(
         raise InputError("`sync` needs PyAV, which is not installed", remedy="pip install 'syncline[video]'")
     listed, warnings = list_videos(folder)
     found = {}
-    for video in listed:
+    for file in listed:
         try:
-            found[video.camera] = VideoReader(video.path)
+            found[file.camera] = VideoReader(file.path)
         except InputError as error:
-            warnings.append(f"{video.path.name}: {error.what}; left out")
+            warnings.append(f"{file.path.name}: {error.what}; left out")
     if calibration is None:
         calibration = _estimate(folder, out / "timing", json)
     reference, known, stds = syncing.read_time_maps(calibration, found)
