@@ -73,8 +73,10 @@ def sync(
             warnings.append(f"{file.path.name}: {error.what}; left out")
     if calibration is None:
         calibration = _estimate(folder, out / "timing", json)
-    reference, known, stds = syncing.read_time_maps(calibration, found)
-    warnings += [f"{v.path.name}: {v.camera} is not in the calibration" for v in listed if v.camera not in known]
+    reference, known, stds, refused = syncing.read_time_maps(calibration, found)
+    unknown = [film.path.name for name, film in found.items() if name not in known]
+    reasons = [refused.get(name, f"{name} is not in the calibration") for name in found if name not in known]
+    warnings += [f"{file}: {why}; left out" for file, why in zip(unknown, reasons, strict=True)]
     used = [video for video in listed if video.camera in known and video.camera in found]
     if not used:
         names = ", ".join(known)

@@ -373,7 +373,9 @@ def test_a_video_that_cannot_be_read_is_left_out_of_the_synchronised_ones_with_a
     (tmp_path / "videos" / "cam0.mp4").write_bytes((recorded.folder / "cam0.mp4").read_bytes()[:3000])
     arguments = ["sync", str(tmp_path / "videos"), "--calibration", str(recorded.out / "calibration.toml")]
     assert run([*arguments, "--videos", "none", "--out", str(tmp_path / "out")]) == 0
-    assert "warning: cam0.mp4: no frame can be read from this file" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "warning: cam0.mp4: no frame can be read from this file" in printed
+    assert "warning: wall.mp4: no observations; left out" in printed  # why the calibration refused it
 
 
 def test_two_cameras_without_lenses_are_synchronised_by_timing_alone(
