@@ -110,7 +110,7 @@ def score_tracks(
     counts. error: mean distance of matches [m]. people: of the truth. tracks: that were scored. instants: scored; left:
     instants of the truth outside the followed span. Raises InputError where TrackEval is missing or nothing overlaps.
     """
-    metrics = _trackeval_metrics()
+    metrics = trackeval_metrics()
     every = np.unique(truth.time)
     half = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.5
     moments = every[(every >= times[0] - half) & (every <= times[-1] + half)]
@@ -199,7 +199,7 @@ def _numbered(gt_ids: list[Ints], ids: list[Ints], similarity: list[Floats]) -> 
     }
 
 
-def _trackeval_metrics() -> list[Any]:
+def trackeval_metrics() -> list[Any]:
     """TrackEval's HOTA, CLEAR and Identity, matching from a similarity of 0.5 on. Raises InputError."""
     try:
         with redirect_stdout(io.StringIO()):  # its import prints which of its other requirements are missing

@@ -22,7 +22,7 @@ from protocols.core.clocks import CameraTime, TimeMap
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import read_text
 from protocols.geometry.types import Floats, Image
-from protocols.session.calibration import read_calibration
+from protocols.session.calibration import read_calibration, stated_calibration
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
@@ -54,8 +54,11 @@ class SynchronisedVideo:
     error: Floats
 
 
-def read_time_maps(file: Path, films: Mapping[str, VideoReader]) -> tuple[str, dict[str, TimeMap], dict[str, float]]:
-    """Reference camera, time maps and stds [s] of a calibration.toml, or from the pairs of a result.json.
+def read_time_maps(
+    file: Path, films: Mapping[str, VideoReader]
+) -> tuple[str, dict[str, TimeMap], dict[str, float], Mapping[str, str]]:
+    """Reference camera, time maps and stds [s] of a calibration.toml, or from the pairs of a result.json; and why other
+    cameras were refused.
 
     A result.json has lags also where no camera could be placed. Raises InputError, and Refused where it has none.
     """
@@ -63,7 +66,8 @@ def read_time_maps(file: Path, films: Mapping[str, VideoReader]) -> tuple[str, d
         rig, cameras = read_calibration(file)
         stds = {name: camera.time_offset_std for name, camera in cameras.items()}
         reference = str(rig.metadata.get("reference", next(iter(rig.cameras))))
-        return reference, {name: camera.time_map for name, camera in cameras.items()}, stds
+        maps = {name: camera.time_map for name, camera in cameras.items()}
+        return reference, maps, stds, stated_calibration(rig, cameras).refused
     try:
         document = json.loads(read_text(file))
         pairs = [
@@ -72,10 +76,11 @@ def read_time_maps(file: Path, films: Mapping[str, VideoReader]) -> tuple[str, d
             if pair.get("lag_s") is not None
             for a, b in (pair["cameras"],)
         ]
+        refused = {str(name): str(why) for name, why in document["metadata"]["refused"].items()}
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         remedy = "give the result.json or the calibration.toml of `calibrate`"
         raise InputError("this is no result of `calibrate`", file=file, remedy=remedy) from None
-    return time_maps_of_pairs(pairs, films)
+    return *time_maps_of_pairs(pairs, films), refused
 
 
 def time_maps_of_pairs(

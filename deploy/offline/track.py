@@ -110,12 +110,21 @@ def _sample(row: Floats) -> Telemetry:
     return Telemetry(float(row[0]), so3.from_quaternion(row[1:5]), position)
 
 
-def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) -> None:
-    """Raise InputError if no sample lies within the video's time span: then it is on another clock."""
-    times = [sample.time for sample in telemetry.samples]
+def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) -> list[str]:
+    """A warning if more than a second of the video's time span has no sample within a second, as on another clock.
+
+    Raises InputError if all of it has none.
+    """
+    times = np.array([sample.time for sample in telemetry.samples])
+    shown = f"times {times[0]:.1f} to {times[-1]:.1f} s, but the video's are {start:.1f} to {end:.1f} s"
+    remedy = "give times on the video's clock, 0 = its first frame"
     if times[0] > end + 1.0 or times[-1] < start - 1.0:
-        what = f"times {times[0]:.1f} to {times[-1]:.1f} s, but the video's are {start:.1f} to {end:.1f} s"
-        raise InputError(what, file=file, remedy="give times on the video's clock, 0 = its first frame")
+        raise InputError(shown, file=file, remedy=remedy)
+    covered = np.clip(np.r_[start - 1.0, times, end + 1.0], start - 1.0, end + 1.0)
+    empty = float(np.maximum(np.diff(covered) - 2.0, 0.0).sum())
+    if not 1.0 < empty < math.inf:
+        return []
+    return [f"{file}: no sample for {empty:.1f} s of the video: {shown}; {remedy}, in seconds"]
 
 
 def count_frames(video: Path) -> int:

@@ -27,8 +27,9 @@ _FPS = 30.0  # where the log does not tell
 class LoggedFlightImages:
     """Images of the agent and boot with the most images. lens, body_from_camera: as known to that agent.
 
-    count: images in the log. repaired: images that cannot be decoded, or whose time does not increase. first_s: camera
-    time of the first image [s]. Raises InputError if the log has no image that can be decoded.
+    count: images in the log. damage: what is wrong with the log, or "". repaired: images that cannot be decoded, or
+    whose time does not increase. first_s: camera time of the first image [s]. Raises InputError if the log has no image
+    that can be decoded.
     """
 
     def __init__(self, log: Path, *, fps: float | None = None, intrinsics: Intrinsics | None = None) -> None:
@@ -40,6 +41,7 @@ class LoggedFlightImages:
             what = "this log contains no flight images"
             raise InputError(what, file=log, remedy="give the video, or record a UAV agent with [images]")
         self._chosen, self.count = names.most_common(1)[0]
+        self.damage = self._reader.damage
         self._info: pb.UavInfo | None = None
         for logged in self._reader.messages([UAV_INFO]):
             message: Any = logged.message

@@ -83,7 +83,8 @@ def is_video_folder(folder: Path) -> bool:
 def list_videos(folder: Path) -> tuple[list[VideoFile], list[str]]:
     """The folder's videos sorted by name, and warnings on skipped ones. Raises InputError."""
     if not folder.is_dir():
-        raise InputError("this folder does not exist", file=folder, remedy="give a folder of videos")
+        what = "is not a folder" if folder.exists() else "this folder does not exist"
+        raise InputError(what, file=folder, remedy="give a folder of videos")
     paths = _video_paths(folder)
     if not paths:
         kinds = ", ".join(sorted(VIDEO_SUFFIXES))
@@ -432,6 +433,7 @@ def _cached_detections(session: Path, camera: str, entry: Any, key: str) -> Vide
                 "rows": tuple(text.splitlines()[1:]),
                 "size": (int(size[0]), int(size[1])),
                 "span": (float(span[0]), float(span[1])),
+                "warnings": tuple(map(str, values["warnings"])),
             }
         )
     except (OSError, KeyError, TypeError, ValueError, IndexError):

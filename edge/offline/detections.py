@@ -37,7 +37,8 @@ class VideoDetections:
 
     rows: lines of observations.csv without its header. frames: number of frames read. frames_with_detection: number
     of those with at least one row. corrupt: frames that could not be decoded. repaired: frames without a usable time
-    stamp. size: (width, height) [px]. fps: mean frame rate [Hz]. span: times [s] of the first and last frame.
+    stamp. size: (width, height) [px]. fps: mean frame rate [Hz]. span: times [s] of the first and last frame. warnings:
+    problems of the video file, one line each.
     """
 
     rows: tuple[str, ...]
@@ -48,16 +49,7 @@ class VideoDetections:
     size: tuple[int, int]
     fps: float
     span: tuple[float, float]
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Problems of the video file, one line each."""
-        warnings = []
-        if self.corrupt:
-            warnings.append(f"{self.corrupt} frames could not be decoded and were skipped")
-        if self.repaired:
-            warnings.append(f"{self.repaired} frames have no usable time stamp")
-        return tuple(warnings)
+    warnings: tuple[str, ...] = ()
 
     def to_csv(self) -> str:
         """The text of observations.csv."""
@@ -120,9 +112,8 @@ def run_detector(
         raise InputError("no frame can be read from this file", file=video.path, remedy="replace it")
     # The container's mean rate is often a guess: measure it.
     fps = (frames - 1) / (last - first) if frames > 1 and last > first else video.info.fps
-    return VideoDetections(
-        tuple(rows), frames, frames_with, video.corrupt, video.repaired, video.info.size, fps, (first, last)
-    )
+    about = video.info.size, fps, (first, last), video.warnings
+    return VideoDetections(tuple(rows), frames, frames_with, video.corrupt, video.repaired, *about)
 
 
 def detected_frames(

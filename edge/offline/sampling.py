@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from edge.devices.playback.video_reader import VideoReader, has_pyav, upright_image
+from edge.devices.playback.video_reader import VideoReader, has_pyav, upright_image, upright_size
 from protocols.geometry.types import Image
 
 _READ_WHOLE = 600  # frames: a shorter video is decoded from its beginning
@@ -41,6 +41,6 @@ def _seek(video: VideoReader, count: int) -> Iterator[Image]:
                 frame = next(container.decode(stream), None)
             except (av.error.FFmpegError, StopIteration):
                 continue
-            if frame is not None and frame.pts != last:
+            if frame is not None and frame.pts != last and upright_size(frame) == video.info.size:
                 last = frame.pts
                 yield upright_image(frame)

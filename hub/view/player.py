@@ -60,7 +60,7 @@ class Recording(Protocol):
 
 
 class LogRecording:
-    """A log that Syncline recorded. Raises InputError."""
+    """A log that Syncline recorded. damage: what is wrong with it, or "". Raises InputError."""
 
     is_static = False
 
@@ -77,6 +77,7 @@ class LogRecording:
         if first is None:
             raise InputError("this log holds nothing to show", file=path, remedy="record cameras or a hub")
         self._first = first
+        self.damage = self._reader.damage
         self.duration = (last - first) / NANOSECONDS
         self._latched.sort(key=lambda timed: timed[0])
         self._times = [time for time, _ in self._latched]

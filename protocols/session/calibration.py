@@ -237,7 +237,8 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
             )
         rate, offset = table.get("clock_rate", 1.0), table.get("time_offset", 0.0)
         if not all(isinstance(v, int | float) and np.isfinite(v) for v in (rate, offset)) or rate <= 0:
-            raise InputError(f"[{name}] clock_rate or time_offset is not a number", file=file, remedy="correct it")
+            what = f"[{name}] time_offset {offset!r} and clock_rate {rate!r} are no clock"
+            raise InputError(what, file=file, remedy="give a number of seconds, and a rate near 1")
         std = camera.position_std
         figures = {key: table.get(key, 0.0) for key in ("time_offset_std", "rms_px")}
         for key, value in figures.items():

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from deploy.commands.common import Flag, Json, answer, open_browser
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import EXIT_BUG, EXIT_DONE, InputError
+from protocols.core.files import read_toml
 
 if TYPE_CHECKING:
     from hub.view.server import ViewServer
@@ -33,8 +34,8 @@ def view(
     """Show a rig in a browser: cameras, trajectories, uncertainty, and missing coverage of each camera.
 
     Without a source, or with an agent's TOML file (its site and [bus] table), it shows the live bus. A .mcap log is
-    played with a timeline. A folder that `syncline calibrate` wrote shows its cameras and trajectory. Prints the
-    address to open.
+    played with a timeline. A folder that `syncline calibrate` wrote, or its calibration.toml, shows its cameras and
+    trajectory. Prints the address to open.
 
     If it serves other machines (--listen), the address contains a token that is required for all access. The
     connection is not encrypted: over a shared network use a tunnel, ssh -L 8080:127.0.0.1:8080 HOST.
@@ -66,7 +67,8 @@ def view(
     rerun
         Write a .rrd file for the rerun viewer from a log or a calibration instead of serving (needs rerun-sdk).
     """
-    recording = None if source is None or source.suffix == ".toml" else _recording(source)
+    live = source is None or (source.suffix == ".toml" and not _is_calibration(source))
+    recording = None if source is None or live else _recording(source)
     if rerun is not None:
         if recording is None:
             raise InputError("--rerun goes with a log or a calibration", remedy="name a .mcap file or a folder")
@@ -113,16 +115,25 @@ def _serve_live(settings: BusConfig, site: str, serve: Callable[[Any], ViewServe
     return EXIT_DONE
 
 
+def _is_calibration(file: Path) -> bool:
+    """Whether a TOML file has the pose of a camera, which no agent's has. Raises InputError."""
+    tables = read_toml(file, "configuration")[0].values()
+    return any(isinstance(table, dict) and "translation" in table for table in tables)
+
+
 def _recording(source: Path) -> Any:
     """The recording at a path. Raises InputError."""
     if not source.exists():
         raise InputError("there is no such file or folder", file=source, remedy="name a log, a folder or a TOML file")
     from hub.view.player import CalibrationRecording, LogRecording
 
-    if source.is_dir() and (source / "calibration.toml").exists():
+    if source.suffix == ".toml" or (source.is_dir() and (source / "calibration.toml").exists()):
         return CalibrationRecording(source)
     if source.suffix == ".mcap" or (source.is_dir() and any(source.glob("*.mcap"))):
-        return LogRecording(source)
+        log = LogRecording(source)
+        if log.damage:
+            print(f"syncline: {source}: damaged: {log.damage}; only its intact part is shown", file=sys.stderr)
+        return log
     remedy = "name a .mcap log, a folder with calibration.toml, or an agent's .toml file"
     raise InputError("neither a log nor a calibration", file=source, remedy=remedy)
 

@@ -157,6 +157,7 @@ def replay(
     if through is not None and out is not None:
         if compare is not None or topics:
             raise InputError("--through processes a whole log", remedy="leave out --compare and --topics")
+        _warn_of_damage(log)
         if through == "uav":
             from deploy.logs.replay_uav import replay_through_uav
 
@@ -178,11 +179,8 @@ def replay(
     from protocols.bus.base import BusStopped
     from protocols.bus.settings import BusConfig
     from protocols.bus.transport.zenoh_bus import open_bus
-    from protocols.log.read.reader import LogReader
 
-    damage = LogReader(log).summary().reason  # reported before an hour of replay, not after it
-    if damage:
-        print(f"syncline: {log}: damaged: {damage}; only its intact part is played", file=sys.stderr)
+    _warn_of_damage(log)
     stop = stop_on_signals()
     try:
         with open_bus(site, BusConfig(connect=tuple(connect or ())), stop=stop.is_set) as bus:
@@ -190,6 +188,14 @@ def replay(
     except BusStopped:
         count = 0
     return answer({"published": count}, [f"{count} messages published"], json)
+
+
+def _warn_of_damage(log: Path) -> None:
+    """Print what is wrong with a log: before an hour of replay, not after it."""
+    from protocols.log.read.reader import LogReader
+
+    if damage := LogReader(log).summary().reason:
+        print(f"syncline: {log}: damaged: {damage}; only its intact part is played", file=sys.stderr)
 
 
 def _compare(log: Path, other: Path, topics: list[str] | None, tolerances: list[str], as_json: bool) -> int:

@@ -170,7 +170,7 @@ def detect(
         remedy = (
             "a lower `score` in its file may find more" if detector else _REMEDIES[mode if mode in _REMEDIES else what]
         )
-        raise Refused(f"{video}: no {what} in any of {found.frames} frames; {remedy}")
+        raise Refused("; ".join((f"{video}: no {what} in any of {found.frames} frames", *found.warnings, remedy)))
     write_together({**files, out: found.to_csv()})
     warnings = [f"{video}: {warning}" for warning in found.warnings]
     document = {

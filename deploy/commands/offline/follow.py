@@ -66,8 +66,9 @@ def follow(
     fps
         Rows a second [Hz]. Default: a row at each frame of the reference camera, or at each time of a shared clock.
     truth
-        True positions, frame,person,x,y or time,person,x,y (any of them with z): adds MODA, MOTA, IDF1 and HOTA to the
-        results. Matches are within 0.5 m on the ground. Needs TrackEval: pip install --no-deps trackeval
+        True positions, frame,person,x,y or time,person,x,y (any of them with z), in the calibration's world and units:
+        adds MODA, MOTA, IDF1 and HOTA to the results. Matches are within 0.5 m on the ground. Needs TrackEval: pip
+        install --no-deps trackeval
     area
         With --truth: x0,x1,y0,y1, the part of the ground that was annotated; nothing outside counts.
     crops
@@ -84,7 +85,7 @@ def follow(
         check_folder(crops)
         if kind != "person":
             raise InputError("--crops shows heads and torsos of people", remedy="leave it out for vehicles")
-    from deploy.evaluation.tracking_scores import parse_area, read_ground_truth, score_tracks
+    from deploy.evaluation.tracking_scores import parse_area, read_ground_truth, score_tracks, trackeval_metrics
     from deploy.offline.follow.calibration import read_given_calibration
     from deploy.offline.follow.crops import check_pictures, write_crops
     from deploy.offline.follow.report import follow_report
@@ -102,6 +103,7 @@ def follow(
             what = "the calibration has no metric scale, and matches are within 0.5 m"
             raise InputError(what, file=calibration, remedy="give the rig a distance, or leave out --truth")
         read_ground_truth(truth, None)  # reported before minutes of detection
+        trackeval_metrics()
     with progress_bar(f"reading {session.name}", quiet=json) as progress:
         source = read_follow_input(
             session,
@@ -128,7 +130,7 @@ def follow(
         count = sum(len(message.detections) for message in source.observations)
         raise Refused(
             f"none of {count} detections made a track: no two cameras see a {kind} at one place for long enough; check "
-            "that the calibration is of these cameras, and their time offsets",
+            "that the calibration is of these cameras, its time offsets, and `up`",
             warnings=result.warnings,
         )
     times = [time_ns / NANOSECONDS for time_ns in source.times_ns]

@@ -65,11 +65,18 @@ def sync(
     if not has_pyav():
         raise InputError("`sync` needs PyAV, which is not installed", remedy="pip install 'syncline[video]'")
     listed, warnings = list_videos(folder)
-    found = {video.camera: VideoReader(video.path) for video in listed if _readable(video.path)}
+    found = {}
+    for file in listed:
+        try:
+            found[file.camera] = VideoReader(file.path)
+        except InputError as error:
+            warnings.append(f"{file.path.name}: {error.what}; left out")
     if calibration is None:
         calibration = _estimate(folder, out / "timing", json)
-    reference, known, stds = syncing.read_time_maps(calibration, found)
-    warnings += [f"{v.path.name}: {v.camera} is not in the calibration" for v in listed if v.camera not in known]
+    reference, known, stds, refused = syncing.read_time_maps(calibration, found)
+    unknown = [film.path.name for name, film in found.items() if name not in known]
+    reasons = [refused.get(name, f"{name} is not in the calibration") for name in found if name not in known]
+    warnings += [f"{file}: {why}; left out" for file, why in zip(unknown, reasons, strict=True)]
     used = [video for video in listed if video.camera in known and video.camera in found]
     if not used:
         names = ", ".join(known)
@@ -96,7 +103,7 @@ def sync(
                 target_or_none = target if videos == "retime" else None
                 done[name] = syncing.retime(film, maps[name], grid, target_or_none, rate, report)
             before += film.info.frames
-            warnings += [f"{film.path.name}: {text}" for text in _reader_warnings(film)]
+            warnings += [f"{film.path.name}: {text}" for text in film.warnings]
     files = {file_in(out, f"{name}.csv"): syncing.times_text(video) for name, video in done.items()}
     if videos != "trim":
         files[out / "synchronised.csv"] = syncing.grid_text(grid, done, csv_cell)
@@ -129,16 +136,6 @@ def sync(
     return answer(document, [*lines, *closing_lines(warnings, written)], json)
 
 
-def _readable(path: Path) -> bool:
-    from edge.devices.playback.video_reader import VideoReader
-
-    try:
-        VideoReader(path)
-    except InputError:
-        return False
-    return True
-
-
 def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
     """Calibrate the videos as far as they allow; the file with their clocks. Raises Refused where there are none."""
     from deploy.offline.video_folder import SESSION, session_from_videos
@@ -162,11 +159,3 @@ def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
             raise
         return out / RESULT
     return out / CALIBRATION
-
-
-def _reader_warnings(film: object) -> list[str]:
-    from edge.devices.playback.video_reader import VideoReader
-
-    assert isinstance(film, VideoReader)
-    warnings = [f"{film.corrupt} frames could not be decoded and were skipped"] if film.corrupt else []
-    return warnings + ([f"{film.repaired} frames have no usable time stamp"] if film.repaired else [])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import replace
@@ -12,6 +13,8 @@ from deploy.commands.common import Flag, Json, NumberList, Scheduler, answer, ch
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError
 from protocols.core.files import check_folder, write_together
+
+_SHORT_S = 0.5  # s: the last frame of a variable rate may last for longer than others
 
 if TYPE_CHECKING:
     from edge.uav.base import Telemetry
@@ -134,8 +137,19 @@ def track(
                 out / tracking.HYPOTHESES: tracking.hypotheses_text(rows),
             }
         )
-    if count and rows[-1].frame + 1 < count:
+    # Of containers that do not count their frames, the number is the duration by the highest rate.
+    ends = count / recording.info.fps - rows[-1].time if rate is None and counted is None else math.inf
+    if count and rows[-1].frame + 1 < count and ends > _SHORT_S:
         warnings.append(f"{video}: {rows[-1].frame + 1} of {count} frames could be decoded")
+    if (
+        model == "ground"
+        and any(sample.position is not None for sample in samples)
+        and not any(math.isfinite(row.estimate.north) for row in rows)
+    ):
+        needs = "metres, down the negative height above the ground, at which the target is 1.2 to 30 m long"
+        warnings.append(f"{telemetry}: its positions were used in no frame: they must be north, east, down in {needs}")
+    if isinstance(recording, LoggedFlightImages) and recording.damage:
+        warnings.append(f"{video}: damaged: {recording.damage}; only its intact part was tracked")
     if recording.repaired:
         warnings.append(f"{video}: {recording.repaired} frames have no usable time stamp")
     scores = score(rows, truth, size) if truth is not None else None
@@ -173,7 +187,7 @@ def _samples(
     samples = recorded.samples
     if not own_clock:
         end = count / recording.info.fps if count else float("inf")
-        tracking.check_clock(recorded, telemetry, flight.start / recording.info.fps, end)
+        warnings += tracking.check_clock(recorded, telemetry, flight.start / recording.info.fps, end)
     elif isinstance(recording, LoggedFlightImages) and telemetry.resolve() == flight.video.resolve():
         # The agent has already put both on one clock.
         samples = tuple(replace(sample, time=sample.time - recording.first_s) for sample in samples)

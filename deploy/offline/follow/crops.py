@@ -38,6 +38,7 @@ _SHOULDERS, _HIPS, _SHOULDER_WIDTH = 0.18, 0.52, 0.30
 0.530 of the stature, and 0.259 across the shoulders; the arms add to that."""
 _MIN_SPEED_M_S = 0.25
 """Who walks more slowly may look anywhere."""
+_REGIONS = "head", "face", "torso"
 _MIN_SIDE_PX = 6  # a smaller crop shows nothing
 _MIN_INSIDE = 0.7
 """Share of a region that must be in the picture."""
@@ -68,11 +69,14 @@ def write_crops(
     known: GivenCalibration,
     progress: Progress = lambda text, share: None,
 ) -> int:
-    """Write ``folder/ID/CAMERA_TIME_{head,face,torso}.jpg``; returns the number of files.
+    """Write ``folder/ID/CAMERA_TIME_{head,face,torso}.jpg``, in place of those of an earlier run; returns their number.
 
     TIME: reference time [s]. One picture a region, track and camera between two of the wanted times. The region of the
     face only where the person walks towards the camera or across its view. Raises InputError, OSError.
     """
+    for region in _REGIONS:
+        for earlier in folder.glob(f"[0-9]*/*_*_{region}.jpg"):  # its numbers are of other people
+            earlier.unlink()
     count = 0
     for index, (name, frames) in enumerate((plan := _wanted(source, tracks, known)).items()):
         for sequence, image, scale in _pictures(source, name, frames.keys()):

@@ -209,10 +209,16 @@ def followed_detections(
         copy = pb.Observation()
         copy.CopyFrom(message)
         del copy.detections[:]
+        seen: set[bytes] = set()
         for detection in _paired(message.detections, left) if kind == "person" else message.detections:
             one = _of_kind(detection, kind, sizes[message.camera] if message.camera in clipped else None, left)
-            if one is not None:
-                copy.detections.append(one)
+            if one is None:
+                continue
+            if (content := one.SerializeToString()) in seen:
+                left.counts["the same as another of its frame"] += 1
+                continue
+            seen.add(content)
+            copy.detections.append(one)
         out.append(copy)
     return out, left
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +32,8 @@ from protocols.topics import OBSERVATION
 
 Progress = Callable[[str, float], None]
 LOG_OF_VIDEOS = "detections.mcap"
+_SAME_TIME_NS = NANOSECONDS
+"""Cameras at 1 Hz need not have their frames at one time."""
 _MAX_ROWS = 2_000_000
 """Reference times at which tracks are wanted: 18 h at 30 Hz."""
 
@@ -182,22 +184,37 @@ def _wanted_times(
         if times:
             by_camera[name] = times
     every = set().union(*by_camera.values())
+    alone = _without_common_time({name: (min(times), max(times)) for name, times in by_camera.items()})
+    if len(alone) == len(by_camera) > 1:
+        raise Refused(f"no two cameras have a time in common: {alone[0]}; is the calibration of this recording?")
     if max(map(abs, every)) > MAX_TIME_NS:
         raise InputError("its times are beyond 146 years", file=known.file, remedy="check time_offset and the session")
     if fps is not None:
         count = round((max(every) - min(every)) * fps / NANOSECONDS) + 1
         if count > _MAX_ROWS:
             raise InputError(f"--fps {fps:g} asks for {count} times", remedy=f"give no more than {_MAX_ROWS}")
-        return [min(every) + round(index * NANOSECONDS / fps) for index in range(count)], ()
+        return [min(every) + round(index * NANOSECONDS / fps) for index in range(count)], alone
     if shared and all(
         known.calibration.cameras[name].time_map.time_offset == 0.0
         and known.calibration.cameras[name].time_map.clock_rate == 1.0
         for name in by_camera
     ):
-        return sorted(every), ()
+        return sorted(every), alone
     reference = known.calibration.reference
     if reference in by_camera:
-        return sorted(by_camera[reference]), ()
+        return sorted(by_camera[reference]), alone
     name = max(by_camera, key=lambda one: len(by_camera[one]))
     warning = f"{reference}, the reference camera, has no frame here: tracks are given at the frames of {name}"
-    return sorted(by_camera[name]), (warning,)
+    return sorted(by_camera[name]), (*alone, warning)
+
+
+def _without_common_time(spans: Mapping[str, tuple[int, int]]) -> tuple[str, ...]:
+    """A line for each camera during whose reference times [ns] no other has any, where there are several."""
+    lines = []
+    for name, (first, last) in spans.items():
+        others = [span for other, span in spans.items() if other != name]
+        if others and not any(a <= last + _SAME_TIME_NS and first <= b + _SAME_TIME_NS for a, b in others):
+            own, rest = (first, last), (min(a for a, _ in others), max(b for _, b in others))
+            here, there = (f"{a / NANOSECONDS:.1f} to {b / NANOSECONDS:.1f} s" for a, b in (own, rest))
+            lines.append(f"{name} has frames from {here} of the reference clock, all others from {there}")
+    return tuple(lines)

@@ -55,7 +55,7 @@ def check_units(messages: Sequence[pb.Observation], known: GivenCalibration, kin
         f"the cameras' positions are about {wrong} for people of {PERSON.size_m:g} m: they are not in {units}",
         file=known.file,
         line=_line_of_units(known),
-        remedy="correct units in [metadata], or the translations",
+        remedy="correct units in [metadata], or the translations, or up",
     )
 
 

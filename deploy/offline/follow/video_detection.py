@@ -157,12 +157,7 @@ def _detect(job: _Job, report: Callable[[float], None]) -> _Detected:
     ]  # fmt: skip
     if not messages:
         raise InputError("no frame can be read from this file", file=job.path, remedy="replace it")
-    warnings = []
-    if video.corrupt:
-        warnings.append(f"{video.corrupt} frames could not be decoded and were skipped")
-    if video.repaired:
-        warnings.append(f"{video.repaired} frames have no usable time stamp")
-    return _Detected(messages, tuple(warnings))
+    return _Detected(messages, video.warnings)
 
 
 Frames = list[tuple[int, float, list["Detection"]]]

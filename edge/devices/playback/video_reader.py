@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".ts", ".3gp", ".mpg"})
+_CUT_S = 1.0  # s: durations of containers count the last frame, and often sound that goes on for longer
 _CONVERT = "check that it is a video this machine can decode (try another player, or convert it to mp4)"
 
 
@@ -51,18 +52,24 @@ class VideoFrame:
 
 @dataclass(frozen=True, slots=True)
 class VideoInfo:
-    """size: (width, height) [px], upright. fps: mean rate. frames: approximate number, 0 = not known."""
+    """size: (width, height) [px], upright. fps: mean rate. frames: approximate number, 0 = not known.
+
+    end: time [s] at which the container says that the video ends; NaN = it does not.
+    """
 
     size: tuple[int, int]
     fps: float
     frames: int
+    end: float = math.nan
 
 
 class VideoReader:
     """Iterates over the frames of a video file, or of an image folder in the order of names, 1/``fps`` apart.
 
     corrupt: number of frames that could not be decoded so far. repaired: number of frames without a usable time stamp,
-    placed one period after their predecessor. Raises InputError if no frame can be read.
+    placed one period after their predecessor. resized: number of frames of another size than the first, which are left
+    out. cut: what a file that ends too early lacks, in words; "" = nothing.
+    Raises InputError if no frame can be read.
     """
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
@@ -70,6 +77,8 @@ class VideoReader:
         self.path = path
         self.corrupt = 0
         self.repaired = 0
+        self.resized = 0
+        self.cut = ""
         self._given_fps = fps
         if path.is_dir():
             self._image_files = image_files(path)
@@ -81,10 +90,22 @@ class VideoReader:
 
     def __iter__(self) -> Iterator[VideoFrame]:
         """All frames from the first one on, in order of time."""
-        self.corrupt = self.repaired = 0
+        self.corrupt = self.repaired = self.resized = 0
         if self.path.is_dir():
             return self._read_folder()
         return self._read_file() if has_pyav() else self._read_opencv()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Problems of the file that reading it has shown so far, one line each."""
+        size = self.info.size
+        found = (
+            (self.corrupt, f"{self.corrupt} frames could not be decoded and were skipped"),
+            (self.repaired, f"{self.repaired} frames have no usable time stamp"),
+            (self.resized, f"{self.resized} frames are not of the first one's size, {size[0]}x{size[1]}, and left out"),
+            (self.cut, self.cut),
+        )
+        return tuple(text for wrong, text in found if wrong)
 
     def _folder_info(self, fps: float) -> VideoInfo:
         for file in self._image_files:
@@ -98,7 +119,8 @@ class VideoReader:
         for index, file in enumerate(self._image_files):
             image = read_image(file)
             if image is None or (image.shape[1], image.shape[0]) != self.info.size:
-                self.corrupt += 1
+                self.corrupt += image is None
+                self.resized += image is not None
                 continue
             # A skipped image still advances the time.
             yield VideoFrame(frame, index / self.info.fps, partial(np.asarray, image))
@@ -119,14 +141,14 @@ class VideoReader:
                 # Some containers have no frame count: use the duration.
                 seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
                 count = stream.frames or round(seconds * rate)
-                rotated = abs(round(first.rotation / 90)) % 2 == 1
-                size = (first.height, first.width) if rotated else (first.width, first.height)
+                end = _stated_end(container)
+                size = upright_size(first)
         except av.error.FFmpegError as error:
             what = f"no frame can be read from this file: {error.strerror}"
             raise InputError(what, file=self.path, remedy=_CONVERT) from None
         if not (math.isfinite(rate) and rate > 0.0):
             raise InputError("the video states no frame rate", file=self.path, remedy="give its fps")
-        return VideoInfo(size, rate, count)
+        return VideoInfo(size, rate, count, end)
 
     def _read_file(self) -> Iterator[VideoFrame]:
         import av
@@ -134,8 +156,9 @@ class VideoReader:
         last, frame = -math.inf, 0
         with av.open(str(self.path)) as container:
             for decoded in self._decoded(container):
-                if decoded.is_corrupt:
-                    self.corrupt += 1
+                if decoded.is_corrupt or upright_size(decoded) != self.info.size:
+                    self.corrupt += decoded.is_corrupt
+                    self.resized += not decoded.is_corrupt
                     continue
                 time = decoded.time
                 if self._given_fps:
@@ -146,6 +169,9 @@ class VideoReader:
                 last = time
                 yield VideoFrame(frame, time, partial(upright_image, decoded))
                 frame += 1
+        if not self._given_fps and not self.resized and last + _CUT_S < self.info.end:
+            says = f"its container says {self.info.end:.1f} s"
+            self.cut = f"it ends at {last:.1f} s, {says}: the file seems to be cut off"
 
     def _decoded(self, container: InputContainer) -> Iterator[AvFrame]:
         """The decoder's frames; packets that cannot be decoded are counted."""
@@ -188,9 +214,29 @@ class VideoReader:
             recording.close()
 
 
+def _stated_end(container: InputContainer) -> float:
+    """Time [s] at which a video ends according to its container; NaN where that says nothing."""
+    stream = container.streams.video[0]
+    begin = float((stream.start_time or 0) * (stream.time_base or 0))
+    if stream.duration and stream.time_base:
+        return begin + float(stream.duration * stream.time_base)
+    # Matroska has durations of tracks in tags, as 00:00:13.998000000, and one of the whole file.
+    hours, minutes, seconds = (stream.metadata.get("DURATION", "").split(":") + ["", ""])[:3]
+    try:
+        return 3600.0 * float(hours) + 60.0 * float(minutes) + float(seconds)
+    except ValueError:
+        return (container.start_time + container.duration) / 1e6 if container.duration else math.nan
+
+
 def has_pyav() -> bool:
     """Whether PyAV is installed."""
     return find_spec("av") is not None
+
+
+def upright_size(decoded: AvFrame) -> tuple[int, int]:
+    """(width, height) [px] of a frame as ``upright_image`` turns it."""
+    turned = abs(round(decoded.rotation / 90)) % 2 == 1
+    return (decoded.height, decoded.width) if turned else (decoded.width, decoded.height)
 
 
 def upright_image(decoded: AvFrame) -> Image:

@@ -19,6 +19,7 @@ from protocols.geometry.types import Bools, Floats
 
 _MAX_SPREAD_M = 0.7
 """Std of the position after a change: beyond, the target could be anywhere, and track initiation must find it again."""
+_MAX_LOG_ODDS = 50.0  # of a manoeuvre: after a pause of hours the odds exceed any float; these are certain already
 _STEP_S = 0.5  # of one step: 120 a minute
 _MANOEUVRE_STD = np.array([model.manoeuvre_std_m_s for model in TARGET_MODELS])
 _MANOEUVRE_RATE = np.array([model.manoeuvres_per_s for model in TARGET_MODELS])
@@ -60,7 +61,8 @@ def manoeuvre_hypothesis(
     covariance[:, POSITION, VELOCITY] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, POSITION] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, VELOCITY] += change
-    return ManoeuvreHypothesis(covariance, np.expm1(_MANOEUVRE_RATE[targets.kind] * np.abs(time)))
+    expected = np.minimum(_MANOEUVRE_RATE[targets.kind] * np.abs(time), _MAX_LOG_ODDS)
+    return ManoeuvreHypothesis(covariance, np.expm1(expected))
 
 
 def log_mixture(odds: Floats, smooth: Floats, changed: Floats) -> Floats:

@@ -87,7 +87,10 @@ class FoxgloveConverter:
         if isinstance(message, pb.Picture):
             return self._picture(where, message, stamp)
         if isinstance(message, pb.CameraInfo):
-            self._sizes[message.camera] = (message.width, message.height)
+            size = message.width, message.height
+            if self._sizes.get(message.camera, size) != size:
+                self._scales.pop(message.camera, None)  # that of its former images
+            self._sizes[message.camera] = size
             if not message.matrix:
                 return []
             self._own_lens.add(message.camera)

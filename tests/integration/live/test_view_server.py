@@ -20,6 +20,7 @@ from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CALIBRATION, CAMERA_INFO, COMMAND, OBSERVATION, STATUS, TRACK
+from tests.support.crowds import write_calibration
 from tests.support.samples import MATRIX, camera_info, eventually, observation, status, track
 from tests.unit.hub.view.test_state import log_of
 
@@ -199,6 +200,7 @@ def test_a_click_sends_a_command_to_the_running_hub(view: ViewServer) -> None:
         (["--listen", "203.0.113.77"], "cannot listen on 203.0.113.77"),
         (["--connect", "nonsense"], "is not an endpoint"),
         (["--rerun", "a.rrd"], "--rerun goes with a log"),
+        (["known.toml", "--connect", "tcp/127.0.0.1:7447"], "--connect goes with the bus, not with a recording"),
     ],
 )
 def test_bad_arguments_are_reported_in_one_line(
@@ -211,6 +213,7 @@ def test_bad_arguments_are_reported_in_one_line(
     monkeypatch.setattr("deploy.agents.signals.stop_on_signals", threading.Event)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
+    write_calibration(tmp_path / "known.toml")  # was taken for an agent's file, and the live bus shown
     assert run(["view", *arguments]) == 2
     error = capsys.readouterr().err
     assert expected in error

@@ -15,6 +15,7 @@ from deploy.cli import run
 from deploy.logs.replay import replay
 from deploy.logs.replay_hub import replay_through_hub
 from hub.live.live_hub import LiveSettings
+from hub.view.player import LogRecording
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.clocks import NANOSECONDS
 from protocols.log.read.reader import LogReader
@@ -178,3 +179,13 @@ def test_a_replay_through_the_hub_gives_equal_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "b.mcap").read_bytes() == (tmp_path / "c.mcap").read_bytes()
     solved = [item.message for item in LogReader(tmp_path / "b.mcap").messages([CALIBRATION])]
     assert [message.status for message in solved] == ["collecting", "solved", "solved"]  # type: ignore[attr-defined]
+
+
+def test_a_damaged_log_is_named_by_every_reader(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = write(tmp_path / "whole.mcap", items()).read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[:-100])
+    for name, damaged in (("whole", False), ("cut", True)):
+        path = tmp_path / f"{name}.mcap"
+        assert run(["replay", str(path), "--through", "hub", "--out", str(tmp_path / f"{name}-hub.mcap")]) == 0
+        assert ("cut.mcap: damaged: " in capsys.readouterr().err) == damaged
+        assert bool(LogRecording(path).damage) == damaged

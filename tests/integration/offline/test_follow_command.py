@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -123,7 +124,9 @@ def refused(arguments: list[str], status: int, capsys: pytest.CaptureFixture[str
     return line
 
 
-def test_bad_input_is_one_line_and_status_2(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line_and_status_2(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = (session / "boxes.csv").read_text(encoding="utf-8")
     bad = tmp_path / "boxes.csv"
     bad.write_text(text + "left,40,5.0,90000,10,40,160\n", encoding="utf-8")
@@ -137,6 +140,12 @@ def test_bad_input_is_one_line_and_status_2(session: Path, tmp_path: Path, capsy
     line = refused(["follow", str(session), *known, "--truth", str(tmp_path / "truth.csv")], 2, capsys)
     assert "truth.csv:" in line
     assert "cannot be read" in line
+    (tmp_path / "truth.csv").write_text("time,person,x,y\n0,a,1,1\n", encoding="utf-8")
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "trackeval.metrics", None)
+        patch.setattr("hub.tracking.offline.follow", None)  # said before the work
+        line = refused(["follow", str(session), *known, "--truth", str(tmp_path / "truth.csv")], 2, capsys)
+    assert "TrackEval, which scores tracks, is not installed" in line
     assert "--crops needs pictures" in refused(["follow", str(session), *known, "--crops", str(tmp_path)], 2, capsys)
     assert "--area goes with --truth" in refused(["follow", str(session), *known, "--area", "-1,1,-1,1"], 2, capsys)
     assert "does not exist" in refused(["follow", str(tmp_path / "nothing"), *known], 2, capsys)

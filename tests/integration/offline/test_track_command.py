@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
+from tests.support.videos import write_video
 
 SIZE = (320, 240)
 FRAMES = 45
@@ -194,3 +195,40 @@ def test_a_gap_in_the_telemetry_does_not_lose_the_target(recording: Path, tmp_pa
     assert run(["track", str(recording / "pictures"), *out, *extra]) == 0
     rows_out = table(tmp_path / "out" / "track.csv")
     assert float(rows_out[30]["x"]) == pytest.approx(92 + 180 + 17.5, abs=6)
+
+
+@pytest.mark.parametrize(
+    ("late", "down", "warning"),
+    [
+        (0.0, -30.0, ""),
+        (0.0, -3000.0, "its positions were used in no frame"),  # centimetres
+        (0.0, 30.0, "its positions were used in no frame"),  # a height in place of a depth
+        (3.0, -30.0, "no sample for 2.0 s of the video: times 3.0 to 8.9 s, but the video's are 0.0 to 4.5 s"),
+    ],
+)
+def test_telemetry_on_another_clock_or_in_other_units_is_named(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], late: float, down: float, warning: str
+) -> None:
+    """Its positions and times were left unused, or used with an error of seconds, without a word."""
+    lines = [f"{late + k / 10},1,0,0,0,0,0,{down}" for k in range(60)]
+    (tmp_path / "t.csv").write_text("\n".join(["time,qw,qx,qy,qz,north,east,down", *lines]) + "\n")
+    extra = ["--rig", str(recording / "rig.toml"), "--telemetry", str(tmp_path / "t.csv"), "--fps", "10"]
+    out = ["--target", TARGET, "--out", str(tmp_path / "out")]
+    assert run(["track", str(recording / "pictures"), *out, *extra]) == 0
+    printed = capsys.readouterr().out
+    assert ("warning:" in printed) == bool(warning)
+    assert warning in printed
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_a_variable_frame_rate_is_no_loss_of_frames(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], share: float
+) -> None:
+    """Matroska has no number of frames."""
+    images = [cv2.imread(str(file)) for file in sorted((recording / "pictures").iterdir())]
+    times = np.cumsum(np.tile([0.05, 0.1, 0.15], FRAMES // 3))
+    write_video(tmp_path / "a.mkv", images, times)
+    content = (tmp_path / "a.mkv").read_bytes()
+    (tmp_path / "a.mkv").write_bytes(content[: int(share * len(content))])
+    assert run(["track", str(tmp_path / "a.mkv"), "--target", TARGET, "--out", str(tmp_path / "out")]) == 0
+    assert ("frames could be decoded" in capsys.readouterr().out) == (share < 1.0)

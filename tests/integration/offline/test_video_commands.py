@@ -366,6 +366,26 @@ def test_videos_are_synchronised_triangulated_and_exported_to_every_format(
     assert len((tmp_path / "track.trc").read_text().splitlines()) > len(again)
 
 
+def test_a_video_that_cannot_be_read_is_left_out_of_the_synchronised_ones_with_a_word(
+    recorded: RecordedVideos, tmp_path: Path, capsys: Capture
+) -> None:
+    shutil.copytree(recorded.folder, tmp_path / "videos")
+    (tmp_path / "videos" / "cam0.mp4").write_bytes((recorded.folder / "cam0.mp4").read_bytes()[:3000])
+    arguments = ["sync", str(tmp_path / "videos"), "--calibration", str(recorded.out / "calibration.toml")]
+    assert run([*arguments, "--videos", "none", "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "warning: cam0.mp4: no frame can be read from this file" in printed
+    assert "warning: wall.mp4: no observations; left out" in printed  # why the calibration refused it
+
+
+def test_nothing_in_a_video_that_is_cut_off_says_that_it_is(tmp_path: Path, capsys: Capture) -> None:
+    write_video(tmp_path / "a.mkv", [numbered_image(i) for i in range(80)], np.arange(80) / 10)
+    content = (tmp_path / "a.mkv").read_bytes()
+    (tmp_path / "a.mkv").write_bytes(content[: len(content) // 2])
+    assert run(["detect", "marker", str(tmp_path / "a.mkv"), "--out", str(tmp_path / "a.csv")]) == 3
+    assert "its container says 7.9 s: the file seems to be cut off; use a brightly" in capsys.readouterr().err
+
+
 def test_two_cameras_without_lenses_are_synchronised_by_timing_alone(
     recorded: RecordedVideos, without_lenses: tuple[Path, Path, str], tmp_path: Path, capsys: Capture
 ) -> None:

@@ -101,6 +101,17 @@ def test_at_most_one_picture_between_two_wanted_times(filmed: FollowInput, tmp_p
     assert len(list((tmp_path / "crops").glob("4/*_head.jpg"))) == 3
 
 
+def test_pictures_of_an_earlier_run_are_replaced(filmed: FollowInput, tmp_path: Path) -> None:
+    """Its track 4 may be somebody else."""
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    (tmp_path / "crops" / "4").mkdir(parents=True)
+    for name in ("left_0.123_head.jpg", "mine.jpg"):
+        (tmp_path / "crops" / "4" / name).write_bytes(b"")
+    count = write_crops(tmp_path / "crops", filmed, [track(0)], known)  # type: ignore[list-item]
+    assert len(list((tmp_path / "crops" / "4").iterdir())) == count + 1
+    assert (tmp_path / "crops" / "4" / "mine.jpg").exists()
+
+
 def test_a_session_without_pictures_is_named(filmed: FollowInput, tmp_path: Path) -> None:
     bare = FollowInput(filmed.name, filmed.observations, filmed.times_ns, (), {})
     with pytest.raises(InputError, match="this session has none"):

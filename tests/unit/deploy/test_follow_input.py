@@ -118,6 +118,22 @@ def test_a_time_that_is_a_clock_step_away_is_left_out_by_name(tmp_path: Path) ->
     assert warning == "left: its clock steps by 1000000000 s; 1 of 6 frames on the other side are left out"
 
 
+def test_a_row_that_is_there_twice_is_one_person(tmp_path: Path) -> None:
+    text = boxes_csv(2.0, 5.0)
+    source = read(tmp_path, text + text.split("\n", 1)[1])
+    assert sum(len(one.detections) for one in source.observations) == text.count("\n") - 1
+    assert source.warnings == (f"{text.count(chr(10)) - 1} rows left out: the same as another of its frame",)
+
+
+def test_cameras_without_a_common_time_are_named(tmp_path: Path) -> None:
+    """Such a camera was followed in alone without a word, and three of them ended the command with a traceback."""
+    offsets = {"left": 0.0, "right": 500.0, "back": 0.0}
+    (warning,) = read(tmp_path, boxes_csv(2.0, 5.0, offsets)).warnings
+    assert warning.startswith("right has frames from -499.9 to -498.1 s of the reference clock, all others from 0.0")
+    with pytest.raises(Refused, match="no two cameras have a time in common: left has frames from"):
+        read(tmp_path, boxes_csv(2.0, 5.0, offsets | {"back": 2e5}))
+
+
 def test_boxes_without_heights_are_asked_for_heights_not_for_points(tmp_path: Path) -> None:
     error = bad(tmp_path, "camera,frame,time,x,y,width\nleft,0,0,100,200,40\n")
     assert "column height is missing" in str(error)

@@ -53,6 +53,33 @@ def test_a_truncated_file_gives_its_readable_frames(tmp_path: Path) -> None:
     assert [read_number(frame.image()) for frame in frames[:10]] == list(range(10))
 
 
+@pytest.mark.parametrize("start", [0.0, 1000.0])
+def test_a_file_that_ends_before_its_container_says_is_reported(tmp_path: Path, start: float) -> None:
+    whole, cut = tmp_path / "whole.mkv", tmp_path / "cut.mkv"
+    write_video(whole, [numbered_image(i) for i in range(100)], start + np.arange(100) / 10)
+    cut.write_bytes(whole.read_bytes()[: int(0.6 * whole.stat().st_size)])
+    warnings = {}
+    for file in (whole, cut):
+        video = VideoReader(file)
+        last = list(video)[-1].time
+        warnings[file] = video.warnings
+    assert warnings[whole] == ()
+    says = f"it ends at {last:.1f} s, its container says {start + 9.9:.1f} s: the file seems to be cut off"
+    assert warnings[cut] == (says,)
+
+
+def test_frames_of_another_size_than_the_first_are_left_out_and_counted(tmp_path: Path) -> None:
+    """Detections in both would be pixels of two scales."""
+    write_video(tmp_path / "a.ts", [numbered_image(i) for i in range(20)], np.arange(20) / 10)
+    small = [np.ascontiguousarray(numbered_image(i)[::2, ::2]) for i in range(20, 30)]
+    write_video(tmp_path / "b.ts", small, np.arange(20, 30) / 10)
+    with (tmp_path / "a.ts").open("ab") as file:
+        file.write((tmp_path / "b.ts").read_bytes())
+    video = VideoReader(tmp_path / "a.ts")
+    assert [read_number(frame.image()) for frame in video] == list(range(20))
+    assert video.warnings == ("10 frames are not of the first one's size, 160x32, and left out",)
+
+
 def test_portrait_videos_are_rotated_upright_as_opencv_does(tmp_path: Path) -> None:
     """A phone held upright stores landscape images and a rotation matrix in the track header."""
     write_video(tmp_path / "a.mp4", [numbered_image(5)] * 3, [0.0, 0.1, 0.2])

@@ -110,6 +110,15 @@ def test_the_manoeuvre_covariance_matches_sampling() -> None:
     assert long.prior_odds[0] == 0.0, "by then it could be anywhere"
 
 
+def test_after_a_pause_of_a_day_a_manoeuvre_has_finite_odds() -> None:
+    """Infinite ones made states that are no numbers, and warnings of numpy."""
+    day = 86_400.0
+    past, future = seen_before("person", day), seen_before("person", -day)
+    state, covariance = fused_predictions(past, future, (day, day), 1.0, np.array([0.0, 0.0, 1.0]))
+    assert np.isfinite(state).all()
+    assert np.isfinite(covariance).all()
+
+
 def test_people_set_off_and_stop_along_the_ground_and_sometimes() -> None:
     person, up = seen_before("person", 0.5), np.array([0.0, 0.0, 1.0])
     manoeuvre = manoeuvre_hypothesis(person, 0.5, 1.0, up)

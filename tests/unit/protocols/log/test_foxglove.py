@@ -176,6 +176,16 @@ def test_picture_lens_and_circles_of_a_camera_are_told_in_the_same_pixels(tmp_pa
     assert list(lens.K) == pytest.approx([250.0, 0.0, 159.5, 0.0, 252.5, 89.5, 0.0, 0.0, 1.0])
     circle = found["foxglove/yard/cam0/annotations"][1].circles[0]
     assert (circle.position.x, circle.position.y, circle.diameter) == pytest.approx((159.5, 89.5, 10.0))
+    # Restarted with smaller images, before the first picture of them.
+    smaller = camera_info("cam0")
+    smaller.width, smaller.height = 320, 180
+    smaller.matrix[:] = [250.0, 0.0, 159.5, 0.0, 252.5, 89.5, 0.0, 0.0, 1.0]
+    detection.u, detection.v, detection.size = 159.5, 89.5, 10.0
+    again = (*messages[:2], (CAMERA_INFO, "cam0", smaller), messages[2])
+    found = seen_in(write(tmp_path / "b.mcap", *again))
+    lens, circle = found["foxglove/yard/cam0/calibration"][1], found["foxglove/yard/cam0/annotations"][1].circles[0]
+    assert (lens.width, lens.height, lens.K[0]) == (320, 180, 250.0)
+    assert (circle.position.x, circle.position.y, circle.diameter) == pytest.approx((159.5, 89.5, 10.0))
 
 
 def test_what_is_no_picture_is_kept_but_shown_to_no_viewer(tmp_path: Path) -> None:
