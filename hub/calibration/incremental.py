@@ -27,7 +27,7 @@ from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, ClockStep, FreeParameters
 from hub.calibration.acceptance import larger_residuals, misfits, network_failure
 from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, final_adjustment
-from hub.calibration.pairs.moved_pair import PairDivision, find_division, time_map_between
+from hub.calibration.pairs.moved_pair import LEAST_SIDE_S, PairDivision, find_division, time_map_between
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
 from hub.calibration.pipeline import calibrate
@@ -212,8 +212,8 @@ def _since_a_move_of_two(
     tried = {True: (known, last)}
     if known:
         as_read = last
-        for name, steps in known.items():
-            as_read = with_clock_set(as_read, name, -sum(size for _, size, _ in steps))
+        for name, found in known.items():
+            as_read = with_clock_set(as_read, name, -sum(size for _, size, _ in found))
         tried[False] = {}, as_read
     for steps, then in tried.values():
         prepared = _with_estimated_lenses(rig, prepare(rig, on_newest_clock(observations, steps)), last)
@@ -270,6 +270,9 @@ def _with_clock_steps(
         if found is None:
             break
         name, step = found
+        newest = max(float(track.time[-1]) for track in observations.of_camera(name))
+        if len(reconstruction.names) == 2 and newest - step[0] < LEAST_SIDE_S:
+            break  # a move of one of two cameras would look alike yet
         trial_steps, trial_last = with_step(steps, name, step), with_clock_set(last, name, step[1])
         trial = start(trial_steps, trial_last)
         if trial[1].names != reconstruction.names or not _are_supported(trial_steps, *trial):

@@ -39,7 +39,7 @@ from protocols.geometry.types import Bools, Floats
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
-_MOST_ROWS, _LEAST_S = 500, 2.0
+_MOST_ROWS, LEAST_SIDE_S = 500, 2.0
 """Rows that are used, and time [s] of each side of a move, without which a pose fits whatever there is."""
 _NOISE_COST, _LEAST_PX, _LEAST_CHI2 = 0.5, 1.0, 100.0
 """Mean squared Sampson distance that rows have at least, over their noise: it had a median of 0.6 where two poses were
@@ -152,7 +152,7 @@ def find_division(a: CameraInput, b: CameraInput, time_map: tuple[float, float])
         lags = [side.centre - rate * fit.intercept for side, fit in zip(sides, fits, strict=True)]
         covariances = [symmetric_inverse(fit.normal) for fit in fits]
         offset = float(np.average(lags, weights=[1.0 / max(float(one[-2, -2]), 1e-12) for one in covariances]))
-    if min(rows.times[at - 1] - rows.times[0], rows.times[-1] - rows.times[at]) < _LEAST_S:
+    if min(rows.times[at - 1] - rows.times[0], rows.times[-1] - rows.times[at]) < LEAST_SIDE_S:
         return None
     held = [rows.held(side, offset, [fit.geometry]) for side, fit in zip(sides, fits, strict=True)]
     poses = [fit.geometry for fit in held if fit is not None and isinstance(fit.geometry, RelativePose)]
