@@ -48,9 +48,9 @@ errors of 0.5 to 2 px it came to 87. In 400 recordings of which nobody moved a c
 375 windows of two recorded rigs, 24 had it, and three had it all."""
 _TRUNCATION_PX, _TRUNCATION_SIGMA, _INITIAL_SIGMA = 10.0, 5.0, 8.0
 """Distance from which a row counts as not explained: the larger one; and misfit at which a refinement starts."""
-_RATE_STD = 2e-4  # of a clock's rate
+_RATE_STD, _WEAKER = 2e-4, 2.0  # of a clock; std of a rotation that shows a move, over that of one that is accepted
 _SUBSET = 150  # rows of five-point hypotheses
-_LAG_ITERATIONS, _STEP_STARTS = 2, 3
+_LAG_ITERATIONS, _STEP_STARTS = 2, 3  # the lag is off by a move at first; steps that are refined, best first
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,7 +170,7 @@ def find_division(a: CameraInput, b: CameraInput, time_map: tuple[float, float])
         gain < MIN_CANDIDATE_RATIO
         or rows.px**2 * (least - cost) < _LEAST_PX**2
         or rows.count / correlated * np.log(gain) < _LEAST_CHI2
-        or variance > MAX_ROTATION_STD**2
+        or variance > (_WEAKER * MAX_ROTATION_STD) ** 2
     ):
         return None
     time = 0.5 * float(rows.times[at - 1] + rows.times[at])
