@@ -24,7 +24,7 @@ _MIN_ROWS = 30
 """Rows of a camera: with two coordinates each, five times its ten unknowns (pose, clock, focal length, k1)."""
 _MAX_RESIDUAL = 0.015  # of the image width: with larger ones the poses are not those of the recording
 _GROWTH, _GROWN_PX = 4.0, 2.0  # times the residuals of a calibration, and px: above both the rows are not like its own
-_MAX_ROTATION_STD = 0.05  # rad
+MAX_ROTATION_STD = 0.05  # rad
 _MAX_CLOCK_STD = 10e-3  # s: a frame is more than three of them
 _MAX_LAG_CHANGE = 20e-3  # s
 _WRONG_LENS = 0.05  # relative error of a focal length that no zoom, crop or temperature explains: another lens
@@ -213,7 +213,7 @@ def _precision(reconstruction: Reconstruction, found: cov.Covariance) -> CameraT
             PrecisionTest(
                 "std of the orientation",
                 float(rotation),
-                _MAX_ROTATION_STD,
+                MAX_ROTATION_STD,
                 "rad",
                 "measured: python -m tests.bench.simulated_rigs",
                 f"{only} orientation only to {np.rad2deg(rotation):.1f}° (std)",

@@ -11,8 +11,9 @@ A camera is tied while its rows fit the trajectory that the others give. The old
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -26,10 +27,11 @@ from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, ClockStep, FreeParameters
 from hub.calibration.acceptance import larger_residuals, misfits, network_failure
 from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, final_adjustment
+from hub.calibration.pairs.moved_pair import LEAST_SIDE_S, PairDivision, find_division, time_map_between
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
 from hub.calibration.pipeline import calibrate
-from hub.calibration.resection.moved_cameras import moved_camera
+from hub.calibration.resection.moved_cameras import Move, moved_camera, without_moved
 from hub.calibration.resection.scan import scan_resection
 from hub.calibration.result import assemble_calibration
 from hub.calibration.self_calibration import focal_prior, initial_self_calibration, with_cameras, with_lens
@@ -50,6 +52,7 @@ from hub.sync.hypothesis import PairSolution, evidence
 from protocols.core.acceptance import PrecisionTest
 from protocols.core.clocks import CameraTime, TimeMap
 from protocols.core.errors import Refused
+from protocols.geometry.pose import Pose
 from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -97,6 +100,9 @@ def update_calibration(
         return Update(found if last is None else _in_published_clock(found, last), {})
     if last.reference in rig.cameras:
         rig = replace(rig, metadata={**rig.metadata, "reference": last.reference})
+    if since := _since_a_move_of_two(rig, observations, last, full):
+        again = partial(update_calibration, rig, search=search, full=full, refine_lenses=refine_lenses)
+        return _from_newest_side(*since, partial(again, clock_priors=clock_priors, arrivals=arrivals))
     given = rig, observations, last, full
     observations, last, (prepared, reconstruction), steps = _with_clock_steps(*given)
     move = moved_camera(prepared, reconstruction)
@@ -178,6 +184,72 @@ def update_calibration(
     return Update(replace(found, cameras=found.cameras | kept, refused=refused), moved)
 
 
+def _from_newest_side(
+    moves: dict[str, Move], rest: Observations, start: Calibration, again: Callable[[Observations, Calibration], Update]
+) -> Update:
+    """The update from the rows since a move of one of two cameras. Raises Refused where they say too little yet."""
+    name, *others = moves
+    warning = moves[name].warning(name, *others)
+    try:
+        update = again(rest, start)
+    except Refused as refusal:
+        raise Refused(f"{warning}; {refusal.reason}", dict.fromkeys(moves, "one of two cameras was moved")) from refusal
+    found = replace(update.calibration, warnings=(*update.calibration.warnings, warning))
+    return Update(found, {name: move.time for name, move in moves.items()} | update.moved)
+
+
+def _since_a_move_of_two(
+    rig: Rig, observations: Observations, last: Calibration, full: bool
+) -> tuple[dict[str, Move], Observations, Calibration] | None:
+    """The move of one of two cameras, as of either, the rows since then, and the answer to start from; None without.
+
+    A known clock step may be what was found of the move, so it is also looked for on the clocks as they were read.
+    """
+    names = [name for name in rig.cameras if name in last.cameras and name in observations.cameras]
+    known = steps_inside(last, observations)
+    if len(names) != 2 or rig.shared_clock:
+        return None
+    tried = {True: (known, last)}
+    if known:
+        as_read = last
+        for name, found in known.items():
+            as_read = with_clock_set(as_read, name, -sum(size for _, size, _ in found))
+        tried[False] = {}, as_read
+    for steps, then in tried.values():
+        prepared = _with_estimated_lenses(rig, prepare(rig, on_newest_clock(observations, steps)), last)
+        if not set(names) <= prepared.cameras.keys():
+            return None
+        states = _initial_states(prepared, then, names, measured_lenses=full)
+        a, b = (prepared.cameras[name] for name in names)
+        division = find_division(a, b, time_map_between(*states.values()))
+        if division is not None:
+            moves = division.moves(prepared, names, observations, keeps_later=True)
+            rest = without_moved(observations, moves)
+            return moves, rest, _after_move(prepared, then, names, division)
+    return None
+
+
+def _after_move(prepared: PreparedSession, last: Calibration, names: list[str], division: PairDivision) -> Calibration:
+    """The answer before with the relative pose and the lag of the rows after a move of one of two cameras.
+
+    The first camera and the baseline's length stay, as nothing shows which camera was moved.
+    """
+    one, other = (last.cameras[name] for name in names)
+    relative, a = division.poses[1], one.pose
+    rotation = relative.rotation @ a.rotation
+    baseline = float(np.linalg.norm(other.pose.position - a.position))
+    pose = Pose(rotation, a.position - baseline * rotation.T @ relative.direction)
+    shown_a, shown_b = (
+        CameraTime(at / prepared.time_scale(name) + prepared.time_origins[name])
+        for name, at in zip(names, division.times, strict=True)
+    )
+    rate = other.time_map.clock_rate
+    offset = float(one.time_map.reference_from_camera(shown_a)) - rate * float(shown_b)
+    moved = replace(other, pose=pose, time_map=TimeMap(rate, offset), clock_steps=())
+    cameras = {**last.cameras, names[0]: replace(one, clock_steps=()), names[1]: moved}
+    return replace(last, cameras=cameras, trajectories=())
+
+
 def _with_clock_steps(
     rig: Rig, observations: Observations, last: Calibration, full: bool, further: bool = True
 ) -> tuple[Observations, Calibration, tuple[PreparedSession, Reconstruction], dict[str, tuple[Step, ...]]]:
@@ -198,6 +270,9 @@ def _with_clock_steps(
         if found is None:
             break
         name, step = found
+        newest = max(float(track.time[-1]) for track in observations.of_camera(name))
+        if len(reconstruction.names) == 2 and newest - step[0] < LEAST_SIDE_S:
+            break  # a move of one of two cameras would look alike yet
         trial_steps, trial_last = with_step(steps, name, step), with_clock_set(last, name, step[1])
         trial = start(trial_steps, trial_last)
         if trial[1].names != reconstruction.names or not _are_supported(trial_steps, *trial):

@@ -27,6 +27,7 @@ from hub.bundle.preprocessing import NO_INTRINSICS, PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
 from hub.calibration.acceptance import LAG_CONFLICT, CameraTests, misfits, network_failure
 from hub.calibration.final_adjustment import final_adjustment
+from hub.calibration.pairs.moved_pair import likely_maps, moves_of_two, time_map_between
 from hub.calibration.pairs.pair_network import (
     Progress,
     coincide,
@@ -35,7 +36,7 @@ from hub.calibration.pairs.pair_network import (
     frame_rate_warnings,
     solve_pairs,
 )
-from hub.calibration.resection.moved_cameras import moved_cameras, without_moved
+from hub.calibration.resection.moved_cameras import Move, moved_cameras, without_moved
 from hub.calibration.resection.set_clocks import between_settings, set_clocks
 from hub.calibration.resection.unconnected import connect_by_resection, listed
 from hub.calibration.result import assemble_calibration, isolated_pair_report
@@ -96,11 +97,7 @@ def calibrate(
                 raise
             rig = replace(rig, bodies={}, scale_bars=rig.scale_bars + _diagonals(rig))
     prepared = prepare(rig, observations)
-    has_sizes = False
-    if solver == "paper" and known is None:
-        from hub.baselines.session_poses import all_tracks_have_sizes  # the other solvers do not need to load it
-
-        has_sizes = all_tracks_have_sizes(prepared, observations)
+    has_sizes = solver == "paper" and known is None and _have_sizes(prepared, observations)
     if has_sizes and prepared.shared_clock:
         pairs = []  # no lags to estimate
     elif solver == "paper" and known is None:
@@ -120,8 +117,16 @@ def calibrate(
         )
     may_move = thorough and solver == "joint" and known is None and not prepared.shared_clock
     again = partial(
-        calibrate, rig, progress=progress, thorough=True, clock_priors=clock_priors, refine_lenses=refine_lenses
+        calibrate,
+        rig,
+        progress=progress,
+        thorough=thorough,
+        clock_priors=clock_priors,
+        arrivals=arrivals,
+        online=online,
+        refine_lenses=refine_lenses,
     )
+    of_two = solver == "joint" and known is None and not prepared.shared_clock and len(prepared.cameras) == 2
     try:
         if known is not None:
             solution = solve_with_known_poses(prepared, pairs, known, report)
@@ -137,25 +142,54 @@ def calibrate(
             solution = solve_with_unknown_lenses(
                 rig, prepared, pairs, report, online=online, refine_lenses=refine_lenses, thorough=thorough
             )
-        left_out = [name for name in prepared.cameras if name in solution.refused]
-        if may_move and (found := _between_settings(left_out, observations, again)):
+        if may_move and (found := _from_still_parts(solution, observations, again)):
             return found
-        if may_move and (moves := moved_cameras(solution, observations)):
-            with suppress(Refused):  # what is left says too little: then all rows have to do
-                found = again(without_moved(observations, moves))
-                warnings = tuple(move.warning(name) for name, move in moves.items())
-                return replace(found, warnings=(*found.warnings, *warnings))
-        report("covariances", 0.95)
-        return assemble_calibration(rig, solution, refine_lenses=refine_lenses, online=online)
+        maps = [time_map_between(*solution.reconstruction.state.cameras)] if of_two else []
+        if not (moves := moves_of_two(solution.prepared, maps, observations, online)):
+            report("covariances", 0.95)
+            return assemble_calibration(rig, solution, refine_lenses=refine_lenses, online=online)
     except Refused as refusal:
         if may_move and (found := _between_settings(prepared.cameras, observations, again)):
             return found
-        failed = ((name, first_failure(tests)) for name, tests in refusal.acceptance.items())
-        conflicting = {name: test for name, test in failed if test is not None and test.name == LAG_CONFLICT}
-        rejected = [replace(p, status=conflicting[p.b].reason) if p.b in conflicting else p for p in pairs]
-        refusal.pairs = tuple(isolated_pair_report(pair, prepared) for pair in rejected)
-        refusal.warnings = prepared.warnings
-        raise
+        likely = likely_maps(rig, observations, prepared, pairs) if of_two else ()
+        if not (moves := moves_of_two(prepared, likely, observations, online)):
+            raise _with_pairs(refusal, prepared, pairs) from None
+    return _from_one_side(moves, observations, again)
+
+
+def _have_sizes(prepared: PreparedSession, observations: Observations) -> bool:
+    """Whether all rows have sizes."""
+    from hub.baselines.session_poses import all_tracks_have_sizes  # the other solvers do not need to load it
+
+    return all_tracks_have_sizes(prepared, observations)
+
+
+def _with_pairs(refusal: Refused, prepared: PreparedSession, pairs: list[PairSolution]) -> Refused:
+    """The refusal with what is known of the pairs."""
+    failed = ((name, first_failure(tests)) for name, tests in refusal.acceptance.items())
+    conflicting = {name: test for name, test in failed if test is not None and test.name == LAG_CONFLICT}
+    rejected = [replace(p, status=conflicting[p.b].reason) if p.b in conflicting else p for p in pairs]
+    refusal.pairs = tuple(isolated_pair_report(pair, prepared) for pair in rejected)
+    refusal.warnings = prepared.warnings
+    return refusal
+
+
+def _from_still_parts(
+    solution: Solution, observations: Observations, again: Callable[[Observations], Calibration]
+) -> Calibration | None:
+    """The calibration without the shorter sides of jumps of clocks, or else of moves of cameras; None without either.
+
+    Also None where what is left says too little: then all rows have to do.
+    """
+    left_out = [name for name in solution.prepared.cameras if name in solution.refused]
+    if found := _between_settings(left_out, observations, again):
+        return found
+    if moves := moved_cameras(solution, observations):
+        with suppress(Refused):
+            found = again(without_moved(observations, moves))
+            warnings = tuple(move.warning(name) for name, move in moves.items())
+            return replace(found, warnings=(*found.warnings, *warnings))
+    return None
 
 
 def _between_settings(
@@ -170,6 +204,20 @@ def _between_settings(
         return None
     warnings = [clock.warning(name) for name, clock in clocks.items() if name in found.cameras]
     return replace(found, warnings=(*found.warnings, *warnings)) if warnings else None
+
+
+def _from_one_side(
+    moves: Mapping[str, Move], observations: Observations, again: Callable[[Observations], Calibration]
+) -> Calibration:
+    """The calibration from one side of a move of one of two cameras. Raises Refused where that says too little."""
+    name, *others = moves
+    warning = moves[name].warning(name, *others)
+    try:
+        found = again(without_moved(observations, moves))
+    except Refused as refusal:
+        refusal.reason = f"{warning}; {refusal.reason}"
+        raise
+    return replace(found, warnings=(*found.warnings, warning))
 
 
 def _has_bodies(rig: Rig, observations: Observations) -> bool:

@@ -63,10 +63,15 @@ class Samples:
 
     def thinned(self, max_count: int) -> Samples:
         """A copy with at most ``max_count`` of these samples, spread evenly."""
+        rows = np.linspace(0, self.count - 1, min(max_count, self.count))
+        out = self.select(np.unique(rows.round().astype(np.int64)))
+        out.seconds_per_sample *= self.count / max(out.count, 1)
+        return out
+
+    def select(self, rows: Ints | Bools) -> Samples:
+        """A copy with some of these samples."""
         out = copy(self)
-        rows = np.unique(np.linspace(0, self.count - 1, min(max_count, self.count)).round().astype(np.int64))
         out.label, out.time, out.points = self.label[rows], self.time[rows], self.points[rows]
-        out.seconds_per_sample = self.seconds_per_sample * self.count / max(len(rows), 1)
         out._recount()
         return out
 

@@ -6,7 +6,7 @@ them, and both poses by far more than one does: a wrong lag or lens and a clock 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,14 +33,14 @@ from hub.calibration.solution import Solution
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations
 
-_STARTS, _ITERATIONS = (0.25, 0.5, 0.75), 5
+STARTS, _ITERATIONS = (0.25, 0.5, 0.75), 5
 """Shares of the rows at which the division begins; then it goes where the two poses say, until it stays."""
 _LEAST_PX = 2.0
 """Rms residual [px] that one pose leaves beyond two. Cameras that stand still gain 1.01 to 1.05 (simulated, also with
 lenses 20 % off, clocks that step, wander or drift), and on two recorded rigs, whose lenses are 2 % off and whose
 detectors wander, up to 3.2 at 1 px, 2.5 at 2.1 px and 1.4 at 2.2 px; a turn by one degree gains 20 at 8 px."""
 _LEAST_S = 1.0  # on each side of a move: half a second of a path gave a pose that was 22° off
-_LEAST_ROWS, _MOST_ROWS = 30, 400
+LEAST_ROWS, _MOST_ROWS = 30, 400
 """Rows of a camera on each side of a move, as many as a camera of a network needs; of all, no more are used."""
 _MARGIN_S = 0.3
 """Around a move, left out too: nobody moves a camera in an instant, and the rows were smoothed across it."""
@@ -56,12 +56,14 @@ class Move:
     keeps_later: bool
     rows: int
 
-    def warning(self, name: str) -> str:
-        """One sentence for a person."""
-        return (
-            f"{name}: it was moved (turned by about {np.degrees(self.turned):.2g}°) at its time {self.time:.1f} s: its "
-            f"{self.rows} rows {'before' if self.keeps_later else 'after'} that were left out"
-        )
+    def warning(self, name: str, *others: str) -> str:
+        """One sentence for a person. others: it was moved or one of these, and by what angle is not known."""
+        side = "before" if self.keeps_later else "after"
+        if others:
+            who = f"one of {', '.join((name, *others))} was moved at {name}'s time {self.time:.1f} s"
+            return f"{who}: the {self.rows} rows {side} that were left out"
+        who = f"{name}: it was moved (turned by about {np.degrees(self.turned):.2g}°) at its time {self.time:.1f} s"
+        return f"{who}: its {self.rows} rows {side} that were left out"
 
 
 def moved_cameras(solution: Solution, observations: Observations) -> dict[str, Move]:
@@ -131,6 +133,27 @@ def _likely_maps(labels: list[SeenLabel], camera: CameraInput) -> list[tuple[flo
     return maps
 
 
+def best_division(
+    count: int, least: int, costs: Callable[[slice], Floats], starts: Iterable[float] = STARTS
+) -> tuple[float, int]:
+    """Mean cost of ``count`` rows by two poses, and how many of them have the first.
+
+    costs: of all rows under the pose that fits a part of them. least: rows on either side.
+    """
+    best = float("inf"), least
+    for start in starts:
+        at = int(start * count)
+        for _ in range(_ITERATIONS):
+            first, second = costs(slice(at)), costs(slice(at, None))
+            total = np.cumsum(first - second) + second.sum()  # where the first ends behind each row
+            new = least + int(np.argmin(total[least - 1 : count - least]))
+            best = min(best, (float(total[new - 1]) / count, new))
+            if new == at:
+                break
+            at = new
+    return best
+
+
 def _divide(
     labels: list[SeenLabel], camera: CameraInput, rate: float, offset: float
 ) -> tuple[float, float, float] | None:
@@ -141,7 +164,7 @@ def _divide(
     order = np.argsort(internal, kind="stable")[:: max(1, len(internal) // _MOST_ROWS)]
     world, image, times = world[order], image[order], (internal[order] - offset) / rate
     count, focal = len(times), camera.intrinsics.focal
-    least = max(MIN_POINTS, _LEAST_ROWS * count // len(internal))
+    least = max(MIN_POINTS, LEAST_ROWS * count // len(internal))
     if count < 2 * least:
         return None
 
@@ -152,18 +175,7 @@ def _divide(
     together = float(costs(slice(None)).mean())
     if together < _LEAST_PX**2:
         return None  # whatever two poses explain
-    best = float("inf"), least
-    for start in _STARTS:
-        at = int(start * count)
-        for _ in range(_ITERATIONS):
-            first, second = costs(slice(at)), costs(slice(at, None))
-            total = np.cumsum(first - second) + second.sum()  # where the first ends behind each row
-            new = least + int(np.argmin(total[least - 1 : count - least]))
-            best = min(best, (float(total[new - 1]) / count, new))
-            if new == at:
-                break
-            at = new
-    cost, at = best
+    cost, at = best_division(count, least, costs)
     if min(times[at - 1] - times[0], times[-1] - times[at]) < _LEAST_S:
         return None
     poses = resect(world[:at], image[:at]), resect(world[at:], image[at:])

@@ -9,6 +9,7 @@ import pytest
 
 from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import CameraTime
+from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -51,6 +52,41 @@ def test_a_moved_camera_is_named_though_the_path_follows_it_where_only_one_other
     session = turned(simulate(16, 4, 60, outliers=0.02, windows=windows), "cam1", 21.0, 0.08)
     (warning,) = [text for text in calibrate(*_given(session), thorough=True).warnings if "it was moved" in text]
     assert warning.startswith("cam1: ")
+
+
+@pytest.mark.parametrize(("seed", "since", "angle"), [(3, 12.0, 0.03), (4, 26.0, 0.2), (5, 18.0, 0.06)])
+def test_a_move_of_one_of_two_cameras_is_named_and_the_longer_side_is_used(
+    seed: int, since: float, angle: float
+) -> None:
+    session = simulate(seed, 2, 40)
+    found = calibrate(*_given(turned(session, "cam1", since, angle)), thorough=True)
+    (warning,) = [text for text in found.warnings if "was moved" in text]
+    shown = session.shown("cam0", since)
+    assert warning.startswith("one of cam0, cam1 was moved at cam0's time ")
+    assert float(warning.split("time ")[1].split(" s")[0]) == pytest.approx(shown, abs=0.5)
+    assert ("rows before that" in warning) == (since < 20.0)
+    pose = session.poses["cam1"]
+    true = so3.exp(np.array([0.0, angle, 0.0])) @ pose.rotation if since < 20.0 else pose.rotation
+    after = replace(session, poses={**session.poses, "cam1": replace(pose, rotation=true)})
+    assert after.turn_error({name: camera.pose for name, camera in found.cameras.items()}) < 0.01
+    assert abs(session.clock_error("cam1", found.reference, found.cameras["cam1"].time_map)) < 1e-3
+
+
+@pytest.mark.parametrize("seed", [3, 4, 6])
+def test_of_two_cameras_a_clock_that_steps_or_a_wrong_lens_is_no_move(seed: int) -> None:
+    session = simulate(seed, 2, 40)
+    late = (np.array(session.camera) == "cam1") & (session.time > session.middle("cam1"))
+    stepped = replace(session, time=session.time + 0.05 * late)
+    lens = session.rig.cameras["cam1"].intrinsics
+    assert lens is not None
+    longer = replace(lens, matrix=lens.matrix @ np.diag([1.02, 1.02, 1.0]))
+    wrong = {**session.rig.cameras, "cam1": replace(session.rig.cameras["cam1"], intrinsics=longer)}
+    for given in (session, stepped, replace(session, rig=replace(session.rig, cameras=wrong))):
+        try:
+            found = calibrate(*_given(given), thorough=True).warnings
+        except Refused as refusal:
+            found = (refusal.reason,)
+        assert not [text for text in found if "moved" in text]
 
 
 def test_cameras_that_stand_still_are_not_moved() -> None:

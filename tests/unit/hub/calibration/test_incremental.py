@@ -161,21 +161,42 @@ def test_a_moved_camera_is_found_again_where_it_stands(shift_m: float, turn_rad:
     assert abs(float(before.reference_from_camera(at)) - float(after.reference_from_camera(at))) < 3e-3
 
 
-@pytest.mark.parametrize("seed", [4, 10])
-def test_a_move_of_one_of_two_cameras_is_not_adjusted_away(seed: int) -> None:
-    """With residuals of 9 and 7 px for 0.7 px before, the path followed both cameras."""
-    session = simulate(seed, 2, 40, windows=[(0, 40)] * 2)
-    last = update_calibration(session.rig, until(session, 20.0), None).calibration
+def with_a_turn(session: Session, since: float, angle: float) -> Session:
+    """The session with cam1 turned about its vertical axis from a true time on [s, rad]."""
     lens, pose = session.rig.cameras["cam1"].intrinsics, session.poses["cam1"]
     assert lens is not None
-    turned = replace(pose, rotation=so3.exp(np.array([0.0, 0.09, 0.0])) @ pose.rotation)
+    turned = replace(pose, rotation=so3.exp(np.array([0.0, angle, 0.0])) @ pose.rotation)
     true = np.array([session.true_time(c, t) for c, t in zip(session.camera, session.time, strict=True)])
-    rows = (np.array(session.camera) == "cam1") & (true > 20.0)
+    rows = (np.array(session.camera) == "cam1") & (true > since)
     path, pixels = session.paths["marker"].at(true[rows]), session.pixels.copy()
     pixels[rows] += lens.project(turned.camera_from_world(path)) - lens.project(pose.camera_from_world(path))
-    with pytest.raises(Refused) as refusal:
-        update_calibration(session.rig, until(replace(session, pixels=pixels), 40.0), last, full=False)
-    assert "cam1" in refusal.value.cameras
+    return replace(session, pixels=pixels, poses={**session.poses, "cam1": turned})
+
+
+@pytest.mark.parametrize(("seed", "angle"), [(4, 0.09), (10, 0.09), (4, -0.03), (12, 0.3)])
+def test_a_move_of_one_of_two_cameras_is_named_and_the_rows_since_then_are_used(seed: int, angle: float) -> None:
+    """It is no clock step, and the path does not follow both poses."""
+    session = simulate(seed, 2, 40, windows=[(0, 40)] * 2)
+    last = update_calibration(session.rig, until(session, 20.0), None).calibration
+    turned = with_a_turn(session, 20.0, angle)
+    update = update_calibration(session.rig, until(turned, 32.0), last, full=False)
+    for name, time in update.moved.items():
+        assert abs(turned.true_time(name, time) - 20.0) < 0.3
+    found = update.calibration
+    (warning,) = [text for text in found.warnings if "was moved" in text]
+    assert warning.startswith("one of cam0, cam1 was moved at cam0's time")
+    assert not any(camera.clock_steps for camera in found.cameras.values())
+    assert turned.turn_error({name: camera.pose for name, camera in found.cameras.items()}) < 0.01
+    assert abs(turned.clock_error("cam1", found.reference, found.cameras["cam1"].time_map)) < 2e-3
+
+
+@pytest.mark.parametrize("seed", [4, 10])
+def test_a_move_of_one_of_two_cameras_is_no_clock_step_before_it_can_be_named(seed: int) -> None:
+    session = simulate(seed, 2, 40, windows=[(0, 40)] * 2)
+    last = update_calibration(session.rig, until(session, 20.0), None).calibration
+    found = update_calibration(session.rig, until(with_a_turn(session, 20.0, 0.09), 21.5), last, full=False).calibration
+    assert not any(camera.clock_steps for camera in found.cameras.values())
+    assert session.turn_error({name: camera.pose for name, camera in found.cameras.items()}) < 0.01
 
 
 def test_cameras_that_see_nothing_any_more_stay_as_they_were() -> None:

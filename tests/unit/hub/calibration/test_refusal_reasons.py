@@ -96,7 +96,7 @@ def ambiguous_rotation(_: pytest.MonkeyPatch) -> str:
 
 
 def imprecise_orientation(patch: pytest.MonkeyPatch) -> str:
-    patch.setattr(calibrating, "_MAX_ROTATION_STD", 1e-9)
+    patch.setattr(calibrating, "MAX_ROTATION_STD", 1e-9)
     return refusal_texts(rigs.simulate(1, 2, SECONDS, late=0.5))
 
 
