@@ -76,7 +76,7 @@ def read_time_maps(
             if pair.get("lag_s") is not None
             for a, b in (pair["cameras"],)
         ]
-        refused = {str(name): str(why) for name, why in document["metadata"]["refused"].items()}
+        refused = {str(name): str(why) for name, why in document.get("metadata", {}).get("refused", {}).items()}
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         remedy = "give the result.json or the calibration.toml of `calibrate`"
         raise InputError("this is no result of `calibrate`", file=file, remedy=remedy) from None

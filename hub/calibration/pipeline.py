@@ -144,7 +144,8 @@ def calibrate(
             )
         if may_move and (found := _from_still_parts(solution, observations, again)):
             return found
-        maps = [time_map_between(*solution.reconstruction.state.cameras)] if of_two else []
+        clocks = solution.reconstruction.state.cameras
+        maps = [time_map_between(*clocks)] if of_two and len(clocks) == 2 == len(solution.prepared.cameras) else []
         if not (moves := moves_of_two(solution.prepared, maps, observations, online)):
             report("covariances", 0.95)
             return assemble_calibration(rig, solution, refine_lenses=refine_lenses, online=online)
