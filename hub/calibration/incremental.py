@@ -24,12 +24,11 @@ from hub.bundle.initialisation import (
     triangulate_and_adjust,
 )
 from hub.bundle.preprocessing import PreparedSession, prepare
-from hub.bundle.problem import CameraState, ClockStep, FreeParameters
+from hub.bundle.problem import LARGE_NETWORK, CameraState, ClockStep, FreeParameters
 from hub.calibration.acceptance import larger_residuals, misfits, network_failure
 from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, final_adjustment
 from hub.calibration.pairs.moved_pair import LEAST_SIDE_S, PairDivision, find_division, time_map_between
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
-from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
 from hub.calibration.pipeline import calibrate
 from hub.calibration.resection.moved_cameras import Move, moved_camera, without_moved
 from hub.calibration.resection.scan import scan_resection

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 from google.protobuf.message import Message
 
+from hub.bundle.problem import LARGE_NETWORK
 from hub.calibration.coverage import CoverageMonitor
-from hub.calibration.pairs.pair_overlap import LARGE_NETWORK
 from hub.calibration.resection.unconnected import listed
 from hub.clocks.observation_stream import LEAST_ROWS, ObservationStream
 from hub.distributed.network.host import NodeHost

@@ -18,7 +18,8 @@ from typing import Literal
 import numpy as np
 
 from hub.bundle.preprocessing import PreparedSession
-from hub.calibration.pairs.pair_overlap import LARGE_NETWORK, candidate_pairs
+from hub.bundle.problem import LARGE_NETWORK
+from hub.calibration.pairs.pair_overlap import candidate_pairs
 from hub.calibration.pairs.synchronised_groups import ENOUGH_PAIRS, MIN_REDUNDANT, SynchronisedGroups, time_span
 from hub.clocks.clock_graph import connected_components
 from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hub.bundle.preprocessing import PreparedSession
+from hub.bundle.problem import LARGE_NETWORK
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.sync.overlap import BIN_S, MOST_PARTNERS, common_seconds
 from hub.sync.settings import PairSettings
@@ -21,9 +22,6 @@ from protocols.geometry.types import Ints
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
-
-LARGE_NETWORK = 24
-"""Cameras from which on pairs are chosen by overlap: up to there all of them take less than the adjustment."""
 
 
 def candidate_pairs(

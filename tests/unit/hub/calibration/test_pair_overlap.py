@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from hub.bundle.preprocessing import PreparedSession, prepare
+from hub.bundle.problem import LARGE_NETWORK
 from hub.calibration.pairs import pair_network
 from hub.calibration.pairs.pair_network import solve_pairs
-from hub.calibration.pairs.pair_overlap import LARGE_NETWORK, candidate_pairs
+from hub.calibration.pairs.pair_overlap import candidate_pairs
 from hub.clocks.clock_graph import connected_components
 from hub.sync.hypothesis import PairSolution
 from tests.support.long_street import street
