@@ -59,6 +59,53 @@ def find_offset(
     visual: rotation seen by the camera. telemetry: by increasing time. body_from_camera: (3, 3). search: lowest and
     highest offset [s]; None: all offsets at which the two overlap by 2 s.
     """
+    found = search_offset(visual, telemetry, body_from_camera, search)
+    if isinstance(found, str):
+        return found
+    if found.evidence < found.threshold:
+        return "the camera rotated too little, or its rotation does not match the telemetry"
+    if found.evidence - found.second < _MIN_LOG_RATIO:
+        return "the offset is ambiguous: the rotation varies too little"
+    if found.at_end:
+        return "the offset lies outside the search window"
+    offset, std, agreement = _refine(found)
+    if std > _MAX_STD_S:
+        return f"its std would be {1e3 * std:.0f} ms: the camera rotated too little, or attitudes are too sparse"
+    return OffsetEstimate(offset, std, agreement)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OffsetSearch:
+    """The maximum over all offsets searched, on the grid.
+
+    evidence, second, threshold: log-likelihood ratio to "uncorrelated" at the maximum, at the best offset elsewhere,
+    and that which noise alone does not reach. at_end: whether it lies at an end of the window. Further: for _refine.
+    """
+
+    evidence: float
+    second: float
+    threshold: float
+    at_end: bool
+    offset: float
+    base: float
+    correlation_time: float
+    visual: tuple[Floats, Floats]
+    telemetry: _IntegratedAngles
+
+    @property
+    def telemetry_rms(self) -> float:
+        """Of the telemetry's rotation, high-pass filtered [rad]."""
+        angles, known = _high_pass(self.telemetry)
+        return float(np.sqrt(np.square(angles).sum() / max(known.sum(), 1.0)))
+
+
+def search_offset(
+    visual: RelativeRotations,
+    telemetry: Sequence[Telemetry],
+    body_from_camera: Floats,
+    search: tuple[float, float] | None = None,
+) -> OffsetSearch | str:
+    """Search all offsets, arguments as of ``find_offset``; a text says why none can be searched."""
     if len(visual.vectors) < 10:
         return "no camera rotation could be measured in the images"
     if len(telemetry) < 5:
@@ -99,17 +146,9 @@ def find_offset(
     second = float(np.max(score[others], initial=-np.inf))
     # The maximum over noise alone grows with the number of independent offsets.
     threshold = _MIN_LOG_RATIO + np.log(max(1.0, len(shifts) * _STEP_S / _PEAK_HALF_WIDTH_S))
-    if peak < threshold:
-        return "the camera rotated too little, or its rotation does not match the telemetry"
-    if peak - second < _MIN_LOG_RATIO:
-        return "the offset is ambiguous: the rotation varies too little"
-    if best in (0, len(shifts) - 1):
-        return "the offset lies outside the search window"
-    coarse = telemetry_start - start + float(shifts[best]) * _STEP_S
-    offset, std, agreement = _refine(a, a_known, from_telemetry, coarse, telemetry_start - start, correlation_time)
-    if std > _MAX_STD_S:
-        return f"its std would be {1e3 * std:.0f} ms: the camera rotated too little, or attitudes are too sparse"
-    return OffsetEstimate(offset, std, agreement)
+    base = telemetry_start - start
+    coarse, at_end = base + float(shifts[best]) * _STEP_S, best in (0, len(shifts) - 1)
+    return OffsetSearch(peak, second, threshold, at_end, coarse, base, correlation_time, (a, a_known), from_telemetry)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,14 +301,13 @@ def _correlation_time(a: Floats, a_known: Floats, b: Floats, b_known: Floats, sh
     return longest
 
 
-def _refine(
-    a: Floats, a_known: Floats, from_telemetry: _IntegratedAngles, coarse: float, base: float, correlation_time: float
-) -> tuple[float, float, float]:
+def _refine(found: OffsetSearch) -> tuple[float, float, float]:
     """The offset refined below the grid step; its std, and the share of the visual rotation that is explained."""
     from scipy.interpolate import CubicSpline
 
-    grid = np.arange(len(from_telemetry.values)) * _STEP_S
-    b, b_known = _high_pass(from_telemetry)
+    (a, a_known), base, coarse, correlation_time = found.visual, found.base, found.offset, found.correlation_time
+    grid = np.arange(len(found.telemetry.values)) * _STEP_S
+    b, b_known = _high_pass(found.telemetry)
     frame_times = np.arange(len(a)) * _STEP_S
     candidates = coarse + np.arange(-3.0 * _STEP_S, 3.0 * _STEP_S, _FINE_STEP_S)
     cross, visual_energy, telemetry_energy = (
