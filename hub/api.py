@@ -318,7 +318,7 @@ def triangulate(
 
 def _read_rows(session: Path, observations: Path | None, rig: Rig) -> tuple[Observations, tuple[str, ...]]:
     """The observations that a path holds, and warnings. The calibration knows the cameras: no rig.toml is needed."""
-    if session.suffix == ".mcap":
+    if is_log(session):
         read = load_session(session, observations)
         return read.observations, read.warnings
     if not session.exists():
