@@ -6,13 +6,19 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from deploy.offline.track import TelemetryFile
 from deploy.offline.track_log import open_recording
 from edge.uav.base import Telemetry
+from edge.uav.timing.telemetry_offset import (
+    OffsetSearch,
+    RelativeRotations,
+    find_offset,
+    search_offset,
+    turned_about_axis,
+)
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry import so3
@@ -21,12 +27,8 @@ from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TELEMETRY
 
-if TYPE_CHECKING:
-    from edge.uav.timing.telemetry_offset import OffsetSearch, RelativeRotations
-
 _MAX_ALIGNMENT_FRAMES = 3600  # two minutes at 30 Hz are enough to estimate the offset
 _MARGIN_S = 3.0  # duration of samples kept before and after the video
-_MIN_TURN_RMS = math.radians(1.0)  # of attitudes about their mean of 2 s: 0.4 degrees of noise do not reach it
 
 _Reading = tuple[Sequence[Telemetry], Floats]
 """Samples and body_from_camera, as they are or by another convention."""
@@ -52,11 +54,14 @@ def _from_ros(rotation: Floats) -> Floats:
 
 
 _CONVENTIONS: dict[str, Callable[[Sequence[Telemetry], Floats], _Reading]] = {
-    "read as x,y,z,w": _each(_last_first),
-    "read as body_from_ned": _each(lambda rotation: rotation.T),
-    "read as ROS's enu_from_flu": _each(_from_ros),
-    "read as ROS's enu_from_flu in x,y,z,w": _each(lambda rotation: _from_ros(_last_first(rotation))),
-    "with body_from_camera transposed": lambda samples, mounting: (samples, mounting.T),
+    "they were x,y,z,w": _each(_last_first),
+    "they were body_from_ned": _each(lambda rotation: rotation.T),
+    "they were ROS's enu_from_flu": _each(_from_ros),
+    "they were ROS's enu_from_flu in x,y,z,w": _each(lambda rotation: _from_ros(_last_first(rotation))),
+    "body_from_camera were transposed": lambda samples, mounting: (samples, mounting.T),
+    "the camera were turned by 90 degrees": lambda samples, mounting: (samples, turned_about_axis(mounting, 1)),
+    "the camera were turned by 180 degrees": lambda samples, mounting: (samples, turned_about_axis(mounting, 2)),
+    "the camera were turned by 270 degrees": lambda samples, mounting: (samples, turned_about_axis(mounting, 3)),
 }
 
 
@@ -100,8 +105,6 @@ def align_to_video(
 
     No samples if the offset can't be estimated; the message gives the reason. progress: called with each frame's index.
     """
-    from edge.uav.timing.telemetry_offset import find_offset
-
     samples = recorded.samples
     (rotations,), time = _visual_rotations(video, fps, lens, [(samples, body_from_camera)], progress)
     offset = find_offset(rotations, samples, body_from_camera)
@@ -131,7 +134,6 @@ def check_attitudes(
 
     Raises InputError where another convention of quaternions or mounting explains what the images show.
     """
-    from edge.uav.timing.telemetry_offset import search_offset
     from edge.uav.timing.telemetry_track import MAX_OFFSET_S
 
     def search(readings: list[_Reading]) -> list[OffsetSearch | None]:
@@ -151,10 +153,10 @@ def check_attitudes(
         if one is not None and one.evidence > least + one.threshold
     }
     if fits:
-        what = f"its attitudes do not turn as the video does, but would {fits[max(fits)]}"
+        what = f"its attitudes do not turn as the video does, but would if {fits[max(fits)]}"
         remedy = "give qw,qx,qy,qz of ned_from_body and body_from_camera; body axes are forward, right, down"
         raise InputError(what, file=file, remedy=remedy)
-    if given is None or given.telemetry_rms < _MIN_TURN_RMS:
+    if given is None or not given.contradicts:
         return []
     turn = f"its attitudes turn by {math.degrees(given.telemetry_rms):.1f} degrees rms, but not as the video does"
     return [f"{file}: {turn}: check body_from_camera in --rig, and that both are of one flight and on one clock"]

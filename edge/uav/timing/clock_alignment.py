@@ -11,7 +11,7 @@ from collections import deque
 import numpy as np
 
 from edge.uav.base import Telemetry
-from edge.uav.timing.telemetry_offset import OffsetEstimate, find_offset
+from edge.uav.timing.telemetry_offset import CONTRADICTION, OffsetEstimate, find_offset
 from edge.uav.timing.visual_rotation import VisualRotationEstimator
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Image
@@ -91,6 +91,11 @@ class ClockAligner:
         self._paused_until_s = -float("inf")
         self.estimate: OffsetEstimate | None = None
         self.reason = "too few images and samples so far"
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the images show another rotation than the telemetry: of another mounting, camera or convention."""
+        return self.reason.startswith(CONTRADICTION)
 
     @property
     def offset_s(self) -> float:

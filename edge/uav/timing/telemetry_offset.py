@@ -27,6 +27,10 @@ _MIN_OVERLAP_S = 2.0  # of images and telemetry
 _FINE_STEP_S = 0.002  # of the refinement, a tenth of _MAX_STD_S; a parabola does the rest
 _GAP_FACTOR = 2.5  # times the median spacing: a longer one is a gap
 _MAX_SPAN_S = 6 * 3600.0  # of images or telemetry: the grids of six hours take 50 MB, and no battery lasts longer
+_MAX_SPACING_S = 0.25 * _HIGH_PASS_WINDOW_S  # of attitudes, for a contradiction: in between it may turn at will
+_MIN_TURN_RMS = float(np.radians(1.0))  # of attitudes about their mean of 2 s: 0.4 degrees of noise do not reach it
+CONTRADICTION = "attitudes turn otherwise than the images"
+"""Begins the reason where telemetry is of another mounting, camera, gimbal or convention."""
 _MAX_STD_S = 0.02  # of an accepted offset: at 30 degrees a second it is half a degree
 
 
@@ -62,6 +66,12 @@ def find_offset(
     found = search_offset(visual, telemetry, body_from_camera, search)
     if isinstance(found, str):
         return found
+    for turns in (1, 2, 3):
+        other = search_offset(visual, telemetry, turned_about_axis(body_from_camera, turns), search)
+        if not isinstance(other, str) and other.evidence > found.evidence + other.threshold:
+            return f"{CONTRADICTION}, but as of a camera turned by {90 * turns} degrees: check body_from_camera"
+    if found.contradicts:
+        return f"{CONTRADICTION}: check body_from_camera, and whether they come late"
     if found.evidence < found.threshold:
         return "the camera rotated too little, or its rotation does not match the telemetry"
     if found.evidence - found.second < _MIN_LOG_RATIO:
@@ -74,17 +84,26 @@ def find_offset(
     return OffsetEstimate(offset, std, agreement)
 
 
+def turned_about_axis(body_from_camera: Floats, turns: int) -> Floats:
+    """The mounting (3, 3) of a camera that is turned about its optical axis by quarter turns."""
+    x, y, z = np.asarray(body_from_camera).T
+    return np.column_stack([(x, y, -x, -y)[turns], (y, -x, -y, x)[turns], z])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class OffsetSearch:
     """The maximum over all offsets searched, on the grid.
 
     evidence, second, threshold: log-likelihood ratio to "uncorrelated" at the maximum, at the best offset elsewhere,
-    and that which noise alone does not reach. at_end: whether it lies at an end of the window. Further: for _refine.
+    and that which noise alone does not reach. telemetry_rms: of its rotation [rad], high-pass filtered, where images
+    are; spacing: of its samples [s]. at_end: whether it lies at an end of the window. Further: for _refine.
     """
 
     evidence: float
     second: float
     threshold: float
+    telemetry_rms: float
+    spacing: float
     at_end: bool
     offset: float
     base: float
@@ -93,10 +112,9 @@ class OffsetSearch:
     telemetry: _IntegratedAngles
 
     @property
-    def telemetry_rms(self) -> float:
-        """Of the telemetry's rotation, high-pass filtered [rad]."""
-        angles, known = _high_pass(self.telemetry)
-        return float(np.sqrt(np.square(angles).sum() / max(known.sum(), 1.0)))
+    def contradicts(self) -> bool:
+        """Whether the telemetry turns by so much that the images would have to show it, and they do not."""
+        return self.evidence < self.threshold and self.telemetry_rms >= _MIN_TURN_RMS and self.spacing <= _MAX_SPACING_S
 
 
 def search_offset(
@@ -146,9 +164,15 @@ def search_offset(
     second = float(np.max(score[others], initial=-np.inf))
     # The maximum over noise alone grows with the number of independent offsets.
     threshold = _MIN_LOG_RATIO + np.log(max(1.0, len(shifts) * _STEP_S / _PEAK_HALF_WIDTH_S))
+    rows = np.flatnonzero(a_known) + int(shifts[best])
+    rows = rows[(rows >= 0) & (rows < len(b))]
+    rms = float(np.sqrt(np.square(b[rows]).sum() / max(b_known[rows].sum(), 1.0)))
     base = telemetry_start - start
     coarse, at_end = base + float(shifts[best]) * _STEP_S, best in (0, len(shifts) - 1)
-    return OffsetSearch(peak, second, threshold, at_end, coarse, base, correlation_time, (a, a_known), from_telemetry)
+    spacing = float(np.median(np.diff([sample.time for sample in telemetry])))
+    return OffsetSearch(
+        peak, second, threshold, rms, spacing, at_end, coarse, base, correlation_time, (a, a_known), from_telemetry
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -253,9 +253,9 @@ def _scaled(q: Floats) -> Floats:
     ("written", "named"),
     [
         (lambda q: q, None),
-        (lambda q: np.roll(q, -1), "would read as x,y,z,w"),
-        (lambda q: q * [1, -1, -1, -1], "would read as body_from_ned"),
-        (lambda q: so3.quaternion(_ENU @ so3.from_quaternion(q) @ _FLU), "would read as ROS's enu_from_flu"),
+        (lambda q: np.roll(q, -1), "would if they were x,y,z,w"),
+        (lambda q: q * [1, -1, -1, -1], "would if they were body_from_ned"),
+        (lambda q: so3.quaternion(_ENU @ so3.from_quaternion(q) @ _FLU), "would if they were ROS's enu_from_flu"),
         (_scaled, "but not as the video does: check body_from_camera"),
     ],
 )

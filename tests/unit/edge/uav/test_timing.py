@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +12,13 @@ import pytest
 from edge.uav.base import Telemetry
 from edge.uav.navigation import Origin
 from edge.uav.timing.clock_alignment import CameraHostClock
-from edge.uav.timing.telemetry_offset import OffsetEstimate, RelativeRotations, find_offset
+from edge.uav.timing.telemetry_offset import CONTRADICTION, OffsetEstimate, RelativeRotations, find_offset
 from edge.uav.timing.telemetry_track import TelemetryTrack
 from edge.uav.timing.vehicle_clock import VehicleClock
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA, Flight, grid_times, rotation
 from edge.uav.world.noise import smoothed_noise
 from protocols.geometry import so3
+from protocols.geometry.types import Floats
 
 SECOND = 1_000_000_000
 
@@ -232,6 +235,25 @@ def test_without_camera_rotation_the_offset_is_not_observable() -> None:
 def test_an_offset_outside_the_search_window_is_rejected() -> None:
     rotations, telemetry = simulated_rotations_and_telemetry(flight(1, 40.0), 3.0, 30.0)
     assert isinstance(find_offset(rotations, telemetry, BODY_FROM_DOWN_CAMERA, (-0.7, 0.7)), str)
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        (lambda r, m: (r, m), ""),
+        (lambda r, m: (r.T, m), "check body_from_camera"),
+        (lambda r, m: (r, m @ np.diag([-1.0, -1.0, 1.0])), "as of a camera turned by 180 degrees"),
+    ],
+)
+@pytest.mark.parametrize("hz", [30.0, 3.0])
+def test_attitudes_of_another_convention_or_mounting_contradict_the_images(
+    changed: Callable[[Floats, Floats], tuple[Floats, Floats]], named: str, hz: float
+) -> None:
+    rotations, telemetry = simulated_rotations_and_telemetry(flight(1, 40.0), 0.1, hz)
+    other = [replace(one, ned_from_body=changed(one.ned_from_body, np.eye(3))[0]) for one in telemetry]
+    found = find_offset(rotations, other, changed(np.eye(3), BODY_FROM_DOWN_CAMERA)[1], (-0.7, 0.7))
+    assert (isinstance(found, str) and found.startswith(CONTRADICTION)) == bool(named)
+    assert named in str(found)
 
 
 def test_geodetic_conversion_round_trips() -> None:
