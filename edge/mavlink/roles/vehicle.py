@@ -30,7 +30,8 @@ from protocols.geometry.types import Floats
 
 _TIMESYNC_PERIOD_S = 0.5  # between TIMESYNC requests
 _RATE_REQUEST_PERIOD_S = 5.0  # of rates, which an autopilot forgets when it reboots
-_MAX_POSITION_AGE_S = 1.0  # for how long a position is extrapolated at its velocity
+_MAX_POSITION_AGE_S = 1.5  # for how long a position is extrapolated at its velocity: one sent each second may be late
+_QUATERNION_S = 0.1  # after a quaternion, in which the same attitude in angles is not used
 _MAX_HEADING_AGE_S = 0.5  # an older heading is not used
 _MAX_LOCAL_AGE_S = 2.0  # without a local position, after which the global one is used
 _SOURCE_SILENT_S = 2.0  # after which another gimbal source may take over
@@ -81,7 +82,7 @@ class Vehicle:
         self._resets = (0, 0)
 
     def motion_at(self, time_s: float) -> tuple[Floats, Floats] | None:
-        """Position from ``origin`` and velocity (3,) NED [m, m/s] at a host time; None if not known for a second."""
+        """Position from ``origin`` and velocity (3,) NED [m, m/s] at a host time; None if not known of late."""
         if self._last_position is None or abs(time_s - self._last_position[0]) >= _MAX_POSITION_AGE_S:
             return None
         at, position, velocity = self._last_position
@@ -223,8 +224,8 @@ class Vehicle:
         time = host_ns / NANOSECONDS
         if quaternion:
             self._quaternion_s = time
-        elif time - self._quaternion_s < 1.0:
-            return []  # the same attitude at lower resolution
+        elif time - self._quaternion_s < _QUATERNION_S:
+            return []
         if self._attitude is not None and 0.0 < telemetry.boot_s <= self._attitude[1].boot_s:
             return []
         self._attitude = (time, telemetry)

@@ -31,6 +31,7 @@ _MAX_SPACING_S = 0.25 * _HIGH_PASS_WINDOW_S  # of attitudes, for a contradiction
 _MIN_TURN_RMS = float(np.radians(1.0))  # of attitudes about their mean of 2 s: 0.4 degrees of noise do not reach it
 CONTRADICTION = "attitudes turn otherwise than the images"
 """Begins the reason where telemetry is of another mounting, camera, gimbal or convention."""
+OUTSIDE = "the offset lies outside the search window"
 _MAX_STD_S = 0.02  # of an accepted offset: at 30 degrees a second it is half a degree
 
 
@@ -77,7 +78,7 @@ def find_offset(
     if found.evidence - found.second < _MIN_LOG_RATIO:
         return "the offset is ambiguous: the rotation varies too little"
     if found.at_end:
-        return "the offset lies outside the search window"
+        return OUTSIDE
     offset, std, agreement = _refine(found)
     if std > _MAX_STD_S:
         return f"its std would be {1e3 * std:.0f} ms: the camera rotated too little, or attitudes are too sparse"

@@ -85,6 +85,20 @@ def test_stamps_of_another_clock_between_the_vehicles_own_never_move_its_clock(e
     assert clock.offset_ns == 500 * SECOND - 5_000_000
 
 
+def test_messages_that_come_late_and_out_of_order_set_no_clock_back() -> None:
+    clock, rng = VehicleClock(), np.random.default_rng(2)
+    stamps = np.arange(600) / 30
+    arrivals = stamps + 0.8 + 0.2 * np.abs(rng.standard_normal(600))
+    trips = 0.0
+    for k in np.argsort(arrivals):
+        while trips < arrivals[k]:  # answered at once
+            clock.handle_round_trip(int(1e9 * trips), int(1e9 * (trips + 100.0)), int(1e9 * trips) + 2_000_000)
+            trips += 0.5
+        assert clock.handle_message(int(1e9 * (stamps[k] + 100.0)), int(1e9 * arrivals[k]))
+    assert (clock.reboots, clock.steps) == (0, 0)
+    assert abs(clock.offset_ns - 100 * SECOND) < 2_000_000
+
+
 def test_an_answer_of_another_clock_to_timesync_is_not_used() -> None:
     clock = VehicleClock()
     clock.handle_message(500 * SECOND, 5_000_000)
