@@ -36,6 +36,7 @@ _MAX_HEADING_AGE_S = 0.5  # an older heading is not used
 _MAX_LOCAL_AGE_S = 2.0  # without a local position, after which the global one is used
 _SOURCE_SILENT_S = 2.0  # after which another gimbal source may take over
 _REFUSAL_SHOWN_S = 10.0  # in the status
+_MAX_SPACING_S = 0.3  # of attitudes: at 4 Hz a target was placed on the ground from the start, at 2 Hz never
 _MISSING_AFTER_S = 3.0  # since a message was asked for
 _GIMBALS = frozenset({AUTOPILOT, GIMBAL, *range(mavlink.MAV_COMP_ID_GIMBAL2, mavlink.MAV_COMP_ID_GIMBAL6 + 1)})
 _NEVER = -math.inf
@@ -77,6 +78,7 @@ class Vehicle:
         self._attitude: tuple[float, Attitude] | None = None
         self._last_position: tuple[float, Floats, Floats] | None = None
         self._local_s = self._quaternion_s = self._sample_s = _NEVER
+        self._spacing_s = 1.0 / rate_hz  # of samples, as a moving mean
         self._next_trip_s = self._next_ask_s = _NEVER
         self._first_s: float | None = None
         self._resets = (0, 0)
@@ -102,7 +104,8 @@ class Vehicle:
         if self._first_s is not None and now - max(self._sample_s, self._first_s) > _MISSING_AFTER_S:
             source = "gimbal (GIMBAL_DEVICE_ATTITUDE_STATUS)" if self._gimbal else "autopilot (ATTITUDE_QUATERNION)"
             return f"no attitude of the {source}" + (f": {refused}" if refused else "")
-        return refused
+        slow = f"attitudes come at {1.0 / self._spacing_s:.1f} Hz, too seldom for positions: ask for 4 Hz or more"
+        return refused or (slow if self._spacing_s > _MAX_SPACING_S else "")
 
     def tick(self, now_ns: int) -> None:
         """Send the TIMESYNC and rate requests that are due."""
@@ -252,6 +255,8 @@ class Vehicle:
         if time <= self._sample_s:
             self.counters["order"] += 1
             return []
+        if self._sample_s != _NEVER:
+            self._spacing_s += 0.2 * (min(time - self._sample_s, _MISSING_AFTER_S) - self._spacing_s)
         self._sample_s = time
         position, velocity = self.motion_at(time) or (None, None)
         vehicle_ns = host_ns + (self.clock.offset_ns if self.clock.known else clock.offset_ns)
