@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from protocols.core.errors import InputError, Refused
-from protocols.core.files import check_folder, write_atomically, write_together
+from protocols.core.files import check_folder, remove_files, write_atomically, write_together
 from protocols.core.tables import dataframe
 from protocols.geometry import so3
 from protocols.log.read.session import is_log, load_session
@@ -274,12 +274,7 @@ def save_refusal(
 
 def remove_outputs(out: Path) -> None:
     """Remove calibration.toml and trajectory.csv of an earlier result. Raises InputError."""
-    for name in (CALIBRATION, TRAJECTORY):
-        try:
-            (out / name).unlink(missing_ok=True)
-        except OSError as error:
-            what = f"cannot be removed: {error.strerror}"
-            raise InputError(what, file=out / name, remedy="choose another --out") from None
+    remove_files(out / name for name in (CALIBRATION, TRAJECTORY))
 
 
 def triangulate(
@@ -323,7 +318,7 @@ def triangulate(
 
 def _read_rows(session: Path, observations: Path | None, rig: Rig) -> tuple[Observations, tuple[str, ...]]:
     """The observations that a path holds, and warnings. The calibration knows the cameras: no rig.toml is needed."""
-    if session.suffix == ".mcap":
+    if is_log(session):
         read = load_session(session, observations)
         return read.observations, read.warnings
     if not session.exists():

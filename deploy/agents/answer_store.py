@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from protocols.core.errors import InputError
-from protocols.core.files import write_together
+from protocols.core.files import check_folder, write_together
 from protocols.core.version import VERSION
 from protocols.session.calibration import Calibration, calibration_text, read_calibration
 from protocols.session.rig import Rig
@@ -35,12 +35,12 @@ class AnswerStore:
     """Writes answers in a thread of its own, atomically; the hub's loop never waits for a disk.
 
     history: how many answers are kept. copy: the calibration.toml that is always the newest. problem: why the last
-    answer could not be kept; "" if it was. kept_unix_s: when the loaded answer was kept.
+    answer could not be kept, or none can; "" if it was. kept_unix_s: when the loaded answer was kept.
     """
 
     def __init__(self, folder: Path, history: int = 200, copy: Path | None = None) -> None:
         self.folder = folder
-        self.problem = ""
+        self.problem = _problem(folder) or ("" if copy is None else _problem(copy.parent))
         self.kept_unix_s = 0.0
         self._history, self._copy = history, copy
         self._writer = ThreadPoolExecutor(1, "answers")
@@ -96,6 +96,14 @@ class AnswerStore:
             self.problem = str(error)
         else:
             self.problem = ""
+
+
+def _problem(folder: Path) -> str:
+    try:
+        check_folder(folder)
+    except InputError as error:
+        return str(error)
+    return ""
 
 
 def _number(file: Path) -> int:

@@ -148,8 +148,12 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
     def keep(hub: LiveHub) -> None:
         if config.solve and known is None and hub.calibration is not None and hub.session is not None:
             store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.links.delays)
+        note(hub)
+
+    def note(hub: LiveHub) -> None:
         hub.notice = f"answers cannot be kept: {store.problem}" if store.problem else ""
 
+    note(hub)
     try:
         run_hub(hub, bus, config.id, stop, rig=rig, beat=beat, export=export, on_result=keep, shard=shard)
     finally:

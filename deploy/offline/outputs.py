@@ -96,7 +96,8 @@ def print_summary(calibration: Calibration, out: Path) -> None:
         for name, camera in calibration.cameras.items()
     ]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    print(f"{len(calibration.cameras)} cameras, {calibration.cpu_seconds:.1f} s of CPU")
+    spent = calibration.cpu_seconds  # 0: a hub's, which solves again and again
+    print(f"{len(calibration.cameras)} cameras" + (f", {spent:.1f} s of CPU" if spent else ""))
     for name, *cells in table:  # plain: to import rich would cost a fiftieth of the whole command
         print("  ".join((name.ljust(widths[0]), *map(str.rjust, cells, widths[1:]))))
     if any(camera.lag_std > 0.0 for camera in calibration.cameras.values()):

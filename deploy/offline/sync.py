@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 _CLOCK_HZ = 90_000  # time base of the written time stamps, the MPEG one
+GRID = "synchronised.csv"
+_TIMES = "frame,time,reference_time"
 _QUALITY = "16"  # crf of x264: visually close to the source
 
 
@@ -290,9 +292,19 @@ class _Writer:
         self._container.mux(self._stream.encode(frame))
 
 
+def earlier_results(out: Path, written: Container[Path]) -> tuple[list[Path], list[Path]]:
+    """Tables of an earlier run in ``out`` that are not ``written`` anew, and its videos, which may be anyone's."""
+    tables = [out / GRID]
+    for file in sorted(out.glob("*.csv")):
+        with file.open("rb") as content:
+            tables += [file] if content.read(len(_TIMES)).decode("utf-8", "replace") == _TIMES else []
+    videos = [file.with_suffix(".mp4") for file in tables]
+    return [file for file in tables if file not in written], [f for f in videos if f.exists() and f not in written]
+
+
 def times_text(video: SynchronisedVideo) -> str:
     """CSV text with frame,time,reference_time of every frame of a video."""
-    lines = ["frame,time,reference_time"]
+    lines = [_TIMES]
     lines += [f"{i},{t:.17g},{r:.17g}" for i, (t, r) in enumerate(zip(video.time, video.reference, strict=True))]
     return "\n".join(lines) + "\n"
 

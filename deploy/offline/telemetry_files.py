@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,16 @@ import numpy as np
 from deploy.offline.track import TelemetryFile
 from deploy.offline.track_log import open_recording
 from edge.uav.base import Telemetry
+from edge.uav.timing.telemetry_offset import (
+    OffsetSearch,
+    RelativeRotations,
+    find_offset,
+    search_offset,
+    turned_about_axis,
+)
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
+from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
@@ -20,6 +29,40 @@ from protocols.topics import TELEMETRY
 
 _MAX_ALIGNMENT_FRAMES = 3600  # two minutes at 30 Hz are enough to estimate the offset
 _MARGIN_S = 3.0  # duration of samples kept before and after the video
+
+_Reading = tuple[Sequence[Telemetry], Floats]
+"""Samples and body_from_camera, as they are or by another convention."""
+
+
+def _each(convert: Callable[[Floats], Floats]) -> Callable[[Sequence[Telemetry], Floats], _Reading]:
+    """A convention by which each ned_from_body is another matrix."""
+
+    def read(samples: Sequence[Telemetry], body_from_camera: Floats) -> _Reading:
+        return [replace(one, ned_from_body=convert(one.ned_from_body)) for one in samples], body_from_camera
+
+    return read
+
+
+def _last_first(rotation: Floats) -> Floats:
+    """The rotation of quaternions x, y, z, w of which (3, 3) was made as if they were w, x, y, z."""
+    return so3.from_quaternion(np.roll(so3.quaternion(rotation), 1))
+
+
+def _from_ros(rotation: Floats) -> Floats:
+    """ned_from_body of ROS's axes (REP 103): east, north, up from forward, left, up."""
+    return np.asarray(rotation[[1, 0, 2]] * np.outer([1.0, 1.0, -1.0], [1.0, -1.0, -1.0]))
+
+
+_CONVENTIONS: dict[str, Callable[[Sequence[Telemetry], Floats], _Reading]] = {
+    "they were x,y,z,w": _each(_last_first),
+    "they were body_from_ned": _each(lambda rotation: rotation.T),
+    "they were ROS's enu_from_flu": _each(_from_ros),
+    "they were ROS's enu_from_flu in x,y,z,w": _each(lambda rotation: _from_ros(_last_first(rotation))),
+    "body_from_camera were transposed": lambda samples, mounting: (samples, mounting.T),
+    "the camera were turned by 90 degrees": lambda samples, mounting: (samples, turned_about_axis(mounting, 1)),
+    "the camera were turned by 180 degrees": lambda samples, mounting: (samples, turned_about_axis(mounting, 2)),
+    "the camera were turned by 270 degrees": lambda samples, mounting: (samples, turned_about_axis(mounting, 3)),
+}
 
 
 def read_telemetry_log(file: Path) -> TelemetryFile:
@@ -62,34 +105,13 @@ def align_to_video(
 
     No samples if the offset can't be estimated; the message gives the reason. progress: called with each frame's index.
     """
-    from edge.uav.timing.telemetry_offset import find_offset
-    from edge.uav.timing.visual_rotation import VisualRotationEstimator, median_tilt_rotation
-
     samples = recorded.samples
-    tilt = median_tilt_rotation(samples, body_from_camera)
-    recording, _ = open_recording(video, fps, lens)
-    try:
-        size = (recording.info.width, recording.info.height)
-        rotation_estimator = VisualRotationEstimator(size, lens)
-        first: float | None = None
-        time, index = 0.0, 0
-        for index in range(_MAX_ALIGNMENT_FRAMES):
-            frame = recording.read(0.0)
-            if frame is None:
-                break
-            moment = frame.device_time_ns / NANOSECONDS
-            first = moment if first is None else first
-            time = moment - first
-            rotation_estimator.update(frame.image, time, tilt)
-            if progress is not None:
-                progress(index)
-    finally:
-        recording.close()
-    offset = find_offset(rotation_estimator.relative_rotations(), samples, body_from_camera)
+    (rotations,), time = _visual_rotations(video, fps, lens, [(samples, body_from_camera)], progress)
+    offset = find_offset(rotations, samples, body_from_camera)
     if isinstance(offset, str):
         return (), f"the telemetry is not used, its clock offset against the video's is not observable: {offset}"
-    # If the video is longer than the frames used for alignment, all later samples are kept.
-    end = float("inf") if index + 1 >= _MAX_ALIGNMENT_FRAMES else offset.offset + time + _MARGIN_S
+    # Where the video is longer than the frames used for alignment, all later samples are kept.
+    end = offset.offset + time + _MARGIN_S
     shifted = tuple(
         replace(sample, time=sample.time - offset.offset)
         for sample in samples
@@ -97,3 +119,74 @@ def align_to_video(
     )
     text = f"telemetry's clock reads {offset.offset:.3f} s (+-{1e3 * offset.std:.0f} ms) at the first frame"
     return shifted, text
+
+
+def check_attitudes(
+    recorded: TelemetryFile,
+    file: Path,
+    video: Path,
+    fps: float | None,
+    lens: Intrinsics,
+    body_from_camera: Floats,
+    progress: Callable[[int], None] | None = None,
+) -> list[str]:
+    """A warning where attitudes on the video's clock turn otherwise than its images.
+
+    Raises InputError where another convention of quaternions or mounting explains what the images show.
+    """
+    from edge.uav.timing.telemetry_track import MAX_OFFSET_S
+
+    def search(readings: list[_Reading]) -> list[OffsetSearch | None]:
+        rotations, _ = _visual_rotations(video, fps, lens, readings, progress)
+        limits = -MAX_OFFSET_S, MAX_OFFSET_S
+        found = [search_offset(seen, *reading, limits) for seen, reading in zip(rotations, readings, strict=True)]
+        return [None if isinstance(one, str) else one for one in found]
+
+    given = search([(recorded.samples, body_from_camera)])[0]  # none where its camera looks at the sky
+    if given is not None and given.evidence >= given.threshold:
+        return []
+    least = 0.0 if given is None else given.evidence
+    others = search([read(recorded.samples, body_from_camera) for read in _CONVENTIONS.values()])
+    fits = {
+        one.evidence: name
+        for name, one in zip(_CONVENTIONS, others, strict=True)
+        if one is not None and one.evidence > least + one.threshold
+    }
+    if fits:
+        what = f"its attitudes do not turn as the video does, but would if {fits[max(fits)]}"
+        remedy = "give qw,qx,qy,qz of ned_from_body and body_from_camera; body axes are forward, right, down"
+        raise InputError(what, file=file, remedy=remedy)
+    if given is None or not given.contradicts:
+        return []
+    turn = f"its attitudes turn by {math.degrees(given.telemetry_rms):.1f} degrees rms, but not as the video does"
+    return [f"{file}: {turn}: check body_from_camera in --rig, and that both are of one flight and on one clock"]
+
+
+def _visual_rotations(
+    video: Path, fps: float | None, lens: Intrinsics, readings: list[_Reading], progress: Callable[[int], None] | None
+) -> tuple[list[RelativeRotations], float]:
+    """The camera's rotations in the video by the tilt of each reading; the time of the last frame used, inf if cut."""
+    from edge.uav.timing.visual_rotation import VisualRotationEstimator, median_tilt_rotation
+
+    recording, _ = open_recording(video, fps, lens)
+    try:
+        size = (recording.info.width, recording.info.height)
+        estimators = [(VisualRotationEstimator(size, lens), median_tilt_rotation(*reading)) for reading in readings]
+        first: float | None = None
+        time = 0.0
+        for index in range(_MAX_ALIGNMENT_FRAMES):
+            frame = recording.read(0.0)
+            if frame is None:
+                break
+            moment = frame.device_time_ns / NANOSECONDS
+            first = moment if first is None else first
+            time = moment - first
+            for estimator, tilt in estimators:
+                estimator.update(frame.image, time, tilt)
+            if progress is not None:
+                progress(index)
+        else:
+            time = math.inf
+    finally:
+        recording.close()
+    return [estimator.relative_rotations() for estimator, _ in estimators], time

@@ -154,7 +154,20 @@ class UavAgent:
         self.camera.tick(now / NANOSECONDS, frame=frame is not None)
         if frame is not None and self.estimator.has_target:
             self.latencies.append((self._now_ns() - earliest_arrival_ns(frame, self.camera_clock, now)) / NANOSECONDS)
-        self._control.update(now, self.estimator.estimate, self._last_frame_s, self._last_sample_s)
+        self._control.update(now, self.estimate, self._last_frame_s, self._last_sample_s)
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """The target's estimate; without a place on the ground where the images contradict the attitudes."""
+        estimate = self.estimator.estimate
+        if estimate is None or not self._contradicted:
+            return estimate
+        nan = math.nan
+        return replace(estimate, north=nan, east=nan, speed=nan, course=nan, std_m=nan)
+
+    @property
+    def _contradicted(self) -> bool:
+        return self.aligner is not None and self.aligner.contradicted
 
     def info(self) -> pb.UavInfo:
         """The message with the settings that a replay of the estimator needs."""
@@ -198,8 +211,9 @@ class UavAgent:
             state, message = "degraded", f"the vehicle is silent for {link_silent_s:.0f} s"
             message += f": {reason}" if reason else ""
         elif not ended:
-            problem = vehicle.problem(self._now_ns()) or reason
-            state = "degraded" if problem.startswith("no attitude") else state
+            contradiction = self.aligner.reason if self.aligner is not None and self._contradicted else ""
+            problem = vehicle.problem(self._now_ns()) or contradiction or reason
+            state = "degraded" if contradiction or problem.startswith("no attitude") else state
             message = problem or self._guidance.hold_reason or "commands are sent"
         counters: Counter[str] = Counter(self.counters)
         for prefix, part in (
@@ -324,9 +338,12 @@ class UavAgent:
             self._publish(out)
         self._update_tracking_status()
         if self.aligner is not None:
+            before = self._contradicted
             self.aligner.handle_frame(image, frame.device_time_ns / NANOSECONDS, self.estimator.has_target)
+            if self._contradicted and not before:
+                self.camera.say("Syncline: attitude unlike the images, no position")
         if self._show is not None:
-            self._show(frame.image, self.estimator.estimate, status_line(self.estimator.estimate))
+            self._show(frame.image, self.estimate, status_line(self.estimate))
 
     def _execute(self, command: OperatorCommand) -> bool:
         """Execute an operator's command; whether it was accepted."""
@@ -379,7 +396,7 @@ class UavAgent:
         settings = self._settings
         update_tracking_status(
             self.camera.status,
-            self.estimator.estimate,
+            self.estimate,
             vehicle,
             settings.size,
             settings.lens,

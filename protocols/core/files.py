@@ -11,7 +11,7 @@ import re
 import stat
 import tempfile
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -161,6 +161,16 @@ def write_together(files: Mapping[Path, str]) -> None:
     finally:
         for temporary, _ in prepared:
             temporary.unlink(missing_ok=True)
+
+
+def remove_files(files: Iterable[Path]) -> None:
+    """Remove files of an earlier result, where there are any. Raises InputError."""
+    for file in files:
+        try:
+            file.unlink(missing_ok=True)
+        except OSError as error:
+            what = f"cannot be removed: {error.strerror}"
+            raise InputError(what, file=file, remedy="choose another --out") from None
 
 
 def write_private(file: Path, content: bytes, mode: int = 0o600) -> None:

@@ -103,7 +103,7 @@ class GroundStation:
 
 @dataclass
 class Flight:
-    """One flight. published: all messages that the agent published on the bus."""
+    """One flight. published: all messages that the agent published on the bus. turned: the camera, about its axis."""
 
     world: FlightWorld
     control: GuidanceLimits = field(default_factory=GuidanceLimits)
@@ -120,6 +120,7 @@ class Flight:
     jpeg_quality: int | None = None
     noise_rad: float = 0.001
     piloted: bool = False
+    turned: np.ndarray = field(default_factory=lambda: np.eye(3))
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -163,6 +164,7 @@ class Flight:
             unix_s=lambda: UNIX_S + self.time,
         )
         mounting = gimbal_from_camera() if self.gimbal is not None else np.asarray(self.world.body_from_camera)
+        mounting = mounting @ self.turned
         config = UavConfig(
             id="drone",
             mount="fixed" if self.gimbal is None else "gimbal",

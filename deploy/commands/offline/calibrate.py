@@ -129,6 +129,7 @@ def _load(
     """Read a session, or make one from a folder of videos. Raises InputError."""
     if observations is None and session.is_dir() and not (session / "observations.csv").exists():
         from deploy.offline.video_folder import SESSION, is_video_folder, session_from_videos
+        from protocols.log.read.session import is_log
 
         if is_video_folder(session):
             if marker is not None and detector not in (None, "marker"):
@@ -139,7 +140,7 @@ def _load(
             for line in () if quiet else gathered.summaries:
                 print(line)
             return gathered
-        if not (session / "rig.toml").exists():
+        if not (session / "rig.toml").exists() and not is_log(session):
             remedy = "put one video a camera in it, or rig.toml and observations.csv"
             raise InputError("this folder holds neither videos nor a session", file=session, remedy=remedy)
     if marker is not None:

@@ -49,7 +49,7 @@ def sync(
     fps
         Frame rate of retimed videos; default: the highest frame rate of the videos.
     """
-    from protocols.core.files import check_folder, file_in, write_together
+    from protocols.core.files import check_folder, file_in, remove_files, write_together
 
     check_folder(out)
     check_range("--fps", fps, 0.1, 1000.0, "give the frame rate in Hz")
@@ -106,7 +106,10 @@ def sync(
             warnings += [f"{film.path.name}: {text}" for text in film.warnings]
     files = {file_in(out, f"{name}.csv"): syncing.times_text(video) for name, video in done.items()}
     if videos != "trim":
-        files[out / "synchronised.csv"] = syncing.grid_text(grid, done, csv_cell)
+        files[out / syncing.GRID] = syncing.grid_text(grid, done, csv_cell)
+    earlier, kept = syncing.earlier_results(out, {*files, *(out / f"{name}.mp4" for name in done if videos != "none")})
+    remove_files(earlier)
+    warnings += [f"{file} is of an earlier run" for file in kept]
     write_together(files)
     written = [str(file) for file in files]
     if videos != "none":

@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from deploy.commands.common import Flag, Json, NumberList, Scheduler, answer, check_rate, check_seed, closing_lines
+from deploy.commands.common import (
+    Flag,
+    Json,
+    NumberList,
+    Scheduler,
+    answer,
+    check_file,
+    check_rate,
+    check_seed,
+    closing_lines,
+)
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError
-from protocols.core.files import check_folder, write_together
+from protocols.core.files import check_folder, remove_files, write_together
 
 _SHORT_S = 0.5  # s: the last frame of a variable rate may last for longer than others
 
@@ -60,9 +71,9 @@ def track(
     rig
         A rig.toml with the camera: matrix, distortions, fps, body_from_camera. One camera, or one named like the video.
     telemetry
-        The drone's telemetry.csv: time,qw,qx,qy,qz[,north,east,down], on the video's clock; or a .tlog or .mcap, whose
-        clock offset is estimated from the rotation seen in the video. The ground model cannot use telemetry without
-        matrix and body_from_camera in --rig, and refuses it.
+        The drone's telemetry.csv: time,qw,qx,qy,qz[,north,east,down], on the video's clock, its attitudes compared with
+        the rotation seen in the video; or a .tlog or .mcap, whose clock offset is estimated from that rotation. The
+        ground model cannot use telemetry without matrix and body_from_camera in --rig, and refuses it.
     model
         ground: on the best frame of reference that the evidence supports: the ground plane, metric or up to scale, the
         stabilised or the plain image; track.csv's column basis has it. paper, plain: the paper's models of a car, for
@@ -88,6 +99,8 @@ def track(
     from edge.devices.playback.video_writer import video_writer
     from edge.uav import tracker_factory
 
+    for name, kind in ((tracking.TRACK, "a table"), (tracking.HYPOTHESES, "a table"), (tracking.OVERLAY, "a video")):
+        check_file(out / name, kind, video, telemetry, csv_truth)
     box = tracking.parse_target(target)
     camera = tracking.choose_camera(rig, video) if rig is not None else None
     truth = read_truth(csv_truth) if csv_truth is not None else None
@@ -131,6 +144,8 @@ def track(
         ):
             # Particles and layers are only for the overlay, and would fill the memory for a long video.
             rows.append(replace(row, estimate=replace(row.estimate, particles=None, layers={})))
+        if not overlay and (out / tracking.TRACK).exists():
+            remove_files([out / tracking.OVERLAY])  # of an earlier result
         write_together(
             {
                 out / tracking.TRACK: tracking.track_text(rows),
@@ -168,12 +183,19 @@ class _Flight(NamedTuple):
     frames: int
 
 
+@contextmanager
+def _watched(what: str, flight: _Flight, quiet: bool) -> Iterator[Callable[[int], None]]:
+    """A function that shows how many frames of a flight's video are done."""
+    with progress_bar(f"{what} {flight.video.name}", quiet=quiet) as progress:
+        yield lambda frame: progress(f"frame {frame}", frame / flight.frames if flight.frames else 0.0)
+
+
 def _samples(
     telemetry: Path, flight: _Flight, quiet: bool, needs_lens: bool
 ) -> tuple[tuple[Telemetry, ...], list[str]]:
     """The telemetry's samples on the video's clock, and warnings. Raises InputError."""
     from deploy.offline import track as tracking
-    from deploy.offline.telemetry_files import align_to_video, read_telemetry_log
+    from deploy.offline.telemetry_files import align_to_video, check_attitudes, read_telemetry_log
     from deploy.offline.track_log import LoggedFlightImages
 
     recording, count, warnings = flight.recording, flight.frames, []
@@ -188,17 +210,17 @@ def _samples(
     if not own_clock:
         end = count / recording.info.fps if count else float("inf")
         warnings += tracking.check_clock(recorded, telemetry, flight.start / recording.info.fps, end)
+        if flight.lens is not None and flight.mounting is not None:
+            with _watched("comparing the telemetry with", flight, quiet) as done:
+                given = flight.video, flight.rate, flight.lens, flight.mounting
+                warnings += check_attitudes(recorded, telemetry, *given, done)
     elif isinstance(recording, LoggedFlightImages) and telemetry.resolve() == flight.video.resolve():
         # The agent has already put both on one clock.
         samples = tuple(replace(sample, time=sample.time - recording.first_s) for sample in samples)
     elif flight.lens is None or flight.mounting is None:
         samples = ()
     else:
-        with progress_bar(f"looking for the telemetry's clock in {flight.video.name}", quiet=quiet) as progress:
-
-            def done(frame: int) -> None:
-                progress(f"frame {frame}", frame / count if count else 0.0)
-
+        with _watched("looking for the telemetry's clock in", flight, quiet) as done:
             samples, line = align_to_video(recorded, flight.video, flight.rate, flight.lens, flight.mounting, done)
         if not samples:
             warnings.append(line)

@@ -56,9 +56,7 @@ def read_tlog(file: Path) -> Tlog:
     if not vehicles:
         raise InputError("no attitude in this log", file=file, remedy="record ATTITUDE at 20 Hz or more")
     system = max(vehicles, key=lambda name: vehicles[name])
-    # The quaternion has the better resolution; using both would duplicate the attitude.
-    quaternion = any(m.get_type() == kinds[1] and m.get_srcSystem() == system for m in messages)
-    return _samples([m for m in messages if m.get_srcSystem() == system], kinds[quaternion], system, unreadable, file)
+    return _samples([m for m in messages if m.get_srcSystem() == system], system, unreadable, file)
 
 
 def _messages(data: bytes) -> tuple[list[Any], int]:
@@ -89,10 +87,13 @@ def _messages(data: bytes) -> tuple[list[Any], int]:
     return out, unreadable
 
 
-def _samples(messages: list[Any], kind: str, system: int, unreadable: int, file: Path) -> Tlog:
+def _samples(messages: list[Any], system: int, unreadable: int, file: Path) -> Tlog:
     """Attitudes with interpolated positions, of the boot with the most attitudes."""
     boots: list[tuple[list[Attitude], list[tuple[float, Floats]]]] = [([], [])]
-    local = any(m.get_type() == "LOCAL_POSITION_NED" for m in messages)
+    # Of two kinds that say the same, the more frequent: both would duplicate it. A station asks for one now and then.
+    counts = Counter(message.get_type() for message in messages)
+    kind = max("ATTITUDE_QUATERNION", "ATTITUDE", key=lambda name: counts[name])
+    local = counts["LOCAL_POSITION_NED"] >= counts["GLOBAL_POSITION_INT"]
     origin: Origin | None = None
     newest, left_out = -1.0, 0
     for message in messages:
@@ -111,7 +112,7 @@ def _samples(messages: list[Any], kind: str, system: int, unreadable: int, file:
                 attitudes.append(telemetry)
             else:
                 left_out += 1
-        elif isinstance(telemetry, LocalPosition) and np.isfinite(telemetry.position).all():
+        elif isinstance(telemetry, LocalPosition) and local and np.isfinite(telemetry.position).all():
             positions.append((telemetry.boot_s, telemetry.position))
         elif isinstance(telemetry, GlobalPosition) and not local:
             if origin is None:  # home has height 0

@@ -30,11 +30,13 @@ from protocols.geometry.types import Floats
 
 _TIMESYNC_PERIOD_S = 0.5  # between TIMESYNC requests
 _RATE_REQUEST_PERIOD_S = 5.0  # of rates, which an autopilot forgets when it reboots
-_MAX_POSITION_AGE_S = 1.0  # for how long a position is extrapolated at its velocity
+_MAX_POSITION_AGE_S = 1.5  # for how long a position is extrapolated at its velocity: one sent each second may be late
+_QUATERNION_S = 0.1  # after a quaternion, in which the same attitude in angles is not used
 _MAX_HEADING_AGE_S = 0.5  # an older heading is not used
 _MAX_LOCAL_AGE_S = 2.0  # without a local position, after which the global one is used
 _SOURCE_SILENT_S = 2.0  # after which another gimbal source may take over
 _REFUSAL_SHOWN_S = 10.0  # in the status
+_MAX_SPACING_S = 0.3  # of attitudes: at 4 Hz a target was placed on the ground from the start, at 2 Hz never
 _MISSING_AFTER_S = 3.0  # since a message was asked for
 _GIMBALS = frozenset({AUTOPILOT, GIMBAL, *range(mavlink.MAV_COMP_ID_GIMBAL2, mavlink.MAV_COMP_ID_GIMBAL6 + 1)})
 _NEVER = -math.inf
@@ -76,12 +78,13 @@ class Vehicle:
         self._attitude: tuple[float, Attitude] | None = None
         self._last_position: tuple[float, Floats, Floats] | None = None
         self._local_s = self._quaternion_s = self._sample_s = _NEVER
+        self._spacing_s = 1.0 / rate_hz  # of samples, as a moving mean
         self._next_trip_s = self._next_ask_s = _NEVER
         self._first_s: float | None = None
         self._resets = (0, 0)
 
     def motion_at(self, time_s: float) -> tuple[Floats, Floats] | None:
-        """Position from ``origin`` and velocity (3,) NED [m, m/s] at a host time; None if not known for a second."""
+        """Position from ``origin`` and velocity (3,) NED [m, m/s] at a host time; None if not known of late."""
         if self._last_position is None or abs(time_s - self._last_position[0]) >= _MAX_POSITION_AGE_S:
             return None
         at, position, velocity = self._last_position
@@ -101,7 +104,8 @@ class Vehicle:
         if self._first_s is not None and now - max(self._sample_s, self._first_s) > _MISSING_AFTER_S:
             source = "gimbal (GIMBAL_DEVICE_ATTITUDE_STATUS)" if self._gimbal else "autopilot (ATTITUDE_QUATERNION)"
             return f"no attitude of the {source}" + (f": {refused}" if refused else "")
-        return refused
+        slow = f"attitudes come at {1.0 / self._spacing_s:.1f} Hz, too seldom for positions: ask for 4 Hz or more"
+        return refused or (slow if self._spacing_s > _MAX_SPACING_S else "")
 
     def tick(self, now_ns: int) -> None:
         """Send the TIMESYNC and rate requests that are due."""
@@ -223,8 +227,8 @@ class Vehicle:
         time = host_ns / NANOSECONDS
         if quaternion:
             self._quaternion_s = time
-        elif time - self._quaternion_s < 1.0:
-            return []  # the same attitude at lower resolution
+        elif time - self._quaternion_s < _QUATERNION_S:
+            return []
         if self._attitude is not None and 0.0 < telemetry.boot_s <= self._attitude[1].boot_s:
             return []
         self._attitude = (time, telemetry)
@@ -251,6 +255,8 @@ class Vehicle:
         if time <= self._sample_s:
             self.counters["order"] += 1
             return []
+        if self._sample_s != _NEVER:
+            self._spacing_s += 0.2 * (min(time - self._sample_s, _MISSING_AFTER_S) - self._spacing_s)
         self._sample_s = time
         position, velocity = self.motion_at(time) or (None, None)
         vehicle_ns = host_ns + (self.clock.offset_ns if self.clock.known else clock.offset_ns)

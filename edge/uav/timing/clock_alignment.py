@@ -11,7 +11,7 @@ from collections import deque
 import numpy as np
 
 from edge.uav.base import Telemetry
-from edge.uav.timing.telemetry_offset import OffsetEstimate, find_offset
+from edge.uav.timing.telemetry_offset import CONTRADICTION, OUTSIDE, OffsetEstimate, find_offset
 from edge.uav.timing.visual_rotation import VisualRotationEstimator
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Image
@@ -93,6 +93,11 @@ class ClockAligner:
         self.reason = "too few images and samples so far"
 
     @property
+    def contradicted(self) -> bool:
+        """Whether the images show another rotation than the telemetry: of another mounting, camera or convention."""
+        return self.reason.startswith(CONTRADICTION)
+
+    @property
     def offset_s(self) -> float:
         """The current offset estimate; 0 at first."""
         return 0.0 if self.estimate is None else self.estimate.offset
@@ -131,7 +136,8 @@ class ClockAligner:
         samples = [sample for sample in self._samples if abs(sample.time - time) < _WINDOW_S + 2.0]
         result = find_offset(rotations, samples, self._mounting, (-_SEARCH_HALF_WIDTH_S, _SEARCH_HALF_WIDTH_S))
         if isinstance(result, str):
-            self.reason = result
+            late = f"{CONTRADICTION} at that time: they come more than {_SEARCH_HALF_WIDTH_S} s late"
+            self.reason = late if result == OUTSIDE else result
             return
         self.reason = ""
         previous = self.estimate

@@ -27,6 +27,11 @@ _MIN_OVERLAP_S = 2.0  # of images and telemetry
 _FINE_STEP_S = 0.002  # of the refinement, a tenth of _MAX_STD_S; a parabola does the rest
 _GAP_FACTOR = 2.5  # times the median spacing: a longer one is a gap
 _MAX_SPAN_S = 6 * 3600.0  # of images or telemetry: the grids of six hours take 50 MB, and no battery lasts longer
+_MAX_SPACING_S = 0.25 * _HIGH_PASS_WINDOW_S  # of attitudes, for a contradiction: in between it may turn at will
+_MIN_TURN_RMS = float(np.radians(1.0))  # of attitudes about their mean of 2 s: 0.4 degrees of noise do not reach it
+CONTRADICTION = "attitudes turn otherwise than the images"
+"""Begins the reason where telemetry is of another mounting, camera, gimbal or convention."""
+OUTSIDE = "the offset lies outside the search window"
 _MAX_STD_S = 0.02  # of an accepted offset: at 30 degrees a second it is half a degree
 
 
@@ -59,6 +64,67 @@ def find_offset(
     visual: rotation seen by the camera. telemetry: by increasing time. body_from_camera: (3, 3). search: lowest and
     highest offset [s]; None: all offsets at which the two overlap by 2 s.
     """
+    found = search_offset(visual, telemetry, body_from_camera, search)
+    if isinstance(found, str):
+        return found
+    for turns in (1, 2, 3):
+        other = search_offset(visual, telemetry, turned_about_axis(body_from_camera, turns), search)
+        if not isinstance(other, str) and other.evidence > found.evidence + other.threshold:
+            return f"{CONTRADICTION}, but as of a camera turned by {90 * turns} degrees: check body_from_camera"
+    if found.contradicts:
+        return f"{CONTRADICTION}: check body_from_camera, and whether they come late"
+    if found.evidence < found.threshold:
+        return "the camera rotated too little, or its rotation does not match the telemetry"
+    if found.evidence - found.second < _MIN_LOG_RATIO:
+        return "the offset is ambiguous: the rotation varies too little"
+    if found.at_end:
+        return OUTSIDE
+    offset, std, agreement = _refine(found)
+    if std > _MAX_STD_S:
+        return f"its std would be {1e3 * std:.0f} ms: the camera rotated too little, or attitudes are too sparse"
+    return OffsetEstimate(offset, std, agreement)
+
+
+def turned_about_axis(body_from_camera: Floats, turns: int) -> Floats:
+    """The mounting (3, 3) of a camera that is turned about its optical axis by quarter turns."""
+    x, y, z = np.asarray(body_from_camera).T
+    return np.column_stack([(x, y, -x, -y)[turns], (y, -x, -y, x)[turns], z])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OffsetSearch:
+    """The maximum over all offsets searched, on the grid.
+
+    evidence, second, threshold: log-likelihood ratio to "uncorrelated" at the maximum, at the best offset elsewhere,
+    and that which noise alone does not reach. telemetry_rms: of its rotation [rad], high-pass filtered, where images
+    are; spacing: of its samples [s]. at_end: whether it lies at an end of the window. Further: for _refine.
+    """
+
+    evidence: float
+    second: float
+    threshold: float
+    telemetry_rms: float
+    spacing: float
+    at_end: bool
+    offset: float
+    base: float
+    correlation_time: float
+    visual: tuple[Floats, Floats]
+    telemetry: _IntegratedAngles
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the telemetry turns by so much that the images would have to show it, and they do not."""
+        return self.evidence < self.threshold and self.telemetry_rms >= _MIN_TURN_RMS and self.spacing <= _MAX_SPACING_S
+
+
+def search_offset(
+    visual: RelativeRotations,
+    telemetry: Sequence[Telemetry],
+    body_from_camera: Floats,
+    search: tuple[float, float] | None = None,
+) -> OffsetSearch | str:
+    """Search all offsets, arguments as of ``find_offset``; a text says why none can be searched."""
     if len(visual.vectors) < 10:
         return "no camera rotation could be measured in the images"
     if len(telemetry) < 5:
@@ -99,17 +165,15 @@ def find_offset(
     second = float(np.max(score[others], initial=-np.inf))
     # The maximum over noise alone grows with the number of independent offsets.
     threshold = _MIN_LOG_RATIO + np.log(max(1.0, len(shifts) * _STEP_S / _PEAK_HALF_WIDTH_S))
-    if peak < threshold:
-        return "the camera rotated too little, or its rotation does not match the telemetry"
-    if peak - second < _MIN_LOG_RATIO:
-        return "the offset is ambiguous: the rotation varies too little"
-    if best in (0, len(shifts) - 1):
-        return "the offset lies outside the search window"
-    coarse = telemetry_start - start + float(shifts[best]) * _STEP_S
-    offset, std, agreement = _refine(a, a_known, from_telemetry, coarse, telemetry_start - start, correlation_time)
-    if std > _MAX_STD_S:
-        return f"its std would be {1e3 * std:.0f} ms: the camera rotated too little, or attitudes are too sparse"
-    return OffsetEstimate(offset, std, agreement)
+    rows = np.flatnonzero(a_known) + int(shifts[best])
+    rows = rows[(rows >= 0) & (rows < len(b))]
+    rms = float(np.sqrt(np.square(b[rows]).sum() / max(b_known[rows].sum(), 1.0)))
+    base = telemetry_start - start
+    coarse, at_end = base + float(shifts[best]) * _STEP_S, best in (0, len(shifts) - 1)
+    spacing = float(np.median(np.diff([sample.time for sample in telemetry])))
+    return OffsetSearch(
+        peak, second, threshold, rms, spacing, at_end, coarse, base, correlation_time, (a, a_known), from_telemetry
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,14 +326,13 @@ def _correlation_time(a: Floats, a_known: Floats, b: Floats, b_known: Floats, sh
     return longest
 
 
-def _refine(
-    a: Floats, a_known: Floats, from_telemetry: _IntegratedAngles, coarse: float, base: float, correlation_time: float
-) -> tuple[float, float, float]:
+def _refine(found: OffsetSearch) -> tuple[float, float, float]:
     """The offset refined below the grid step; its std, and the share of the visual rotation that is explained."""
     from scipy.interpolate import CubicSpline
 
-    grid = np.arange(len(from_telemetry.values)) * _STEP_S
-    b, b_known = _high_pass(from_telemetry)
+    (a, a_known), base, coarse, correlation_time = found.visual, found.base, found.offset, found.correlation_time
+    grid = np.arange(len(found.telemetry.values)) * _STEP_S
+    b, b_known = _high_pass(found.telemetry)
     frame_times = np.arange(len(a)) * _STEP_S
     candidates = coarse + np.arange(-3.0 * _STEP_S, 3.0 * _STEP_S, _FINE_STEP_S)
     cross, visual_energy, telemetry_energy = (

@@ -175,7 +175,8 @@ class VehicleClock:
 
         Out of order alone is no proof: it would make every later message later as well.
         """
-        offset, best = vehicle_ns - host_ns, self._estimate()
+        # Of messages alone: on a link that delays all of them, none comes earlier than by their least delay.
+        offset, best = vehicle_ns - host_ns, self._best(self._one_way, host_ns)
         if self._set_back is None and vehicle_ns < self._newest_ns - _STEP_NS:
             self._set_back = _Candidate(host_ns, vehicle_ns, offset)
         candidate = self._set_back

@@ -113,7 +113,8 @@ def test_a_disk_that_cannot_be_written_is_told(session: Session, kept: Path, tmp
     assert last is not None
     blocked = tmp_path / "file"
     blocked.write_text("", encoding="utf-8")
-    store = AnswerStore(blocked)
+    store = AnswerStore(tmp_path, copy=blocked / "calibration.toml")
+    assert "not a folder" in store.problem, "before the first answer"
     store.keep(last[0], session.rig, last[1], last[2])
     store.close()
     assert "file" in store.problem

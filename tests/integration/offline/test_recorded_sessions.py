@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
+from deploy.cli import run
 from edge import scenes
 from hub.api import calibrate, read_session
 from protocols.core.clocks import CameraTime
@@ -25,6 +26,7 @@ TOPICS = {"CameraInfo": CAMERA_INFO, "Observation": OBSERVATION, "AgentStatus": 
 
 
 def recorded(file: Path, content: Iterable[Message]) -> Path:
+    file.parent.mkdir(exist_ok=True)
     with LogWriter(file, {}) as writer:
         for number, message in enumerate(content):
             agent = getattr(message, "camera", "") or getattr(message, "agent", "")
@@ -57,6 +59,15 @@ def test_a_clock_that_is_set_in_the_middle_of_a_log_costs_the_shorter_side(tmp_p
     assert abs(true) < 3e-3
     (warning,) = [text for text in found.warnings if "clock of cam1 stepped" in text]
     assert "+7.0" in warning
+
+
+def test_the_folder_of_a_recording_is_calibrated_and_triangulated_as_its_log(tmp_path: Path) -> None:
+    recorded(tmp_path / "parts" / "a.mcap", messages(simulate(72, 3, 20)))
+    out, track = tmp_path / "out", tmp_path / "track.csv"
+    assert run(["calibrate", str(tmp_path / "parts"), "--out", str(out)]) == 0
+    known = ["--calibration", str(out / "calibration.toml")]
+    assert run(["triangulate", str(tmp_path / "parts"), *known, "--out", str(track)]) == 0
+    assert track.exists()
 
 
 def test_people_in_a_log_become_labelled_walkers(tmp_path: Path) -> None:

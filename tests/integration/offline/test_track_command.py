@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -11,11 +12,15 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
+from deploy.simulation.flight import write_simulated_flight
+from protocols.geometry import so3
+from protocols.geometry.types import Floats
 from tests.support.videos import write_video
 
 SIZE = (320, 240)
 FRAMES = 45
 TARGET = "92,118,36,16"
+_ENU, _FLU = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1.0, -1, -1])
 
 
 def render_frame(
@@ -120,6 +125,18 @@ def test_a_video_file_gives_its_own_times_and_a_larger_overlay(recording: Path, 
     assert sorted(path.name for path in out.iterdir()) == ["hypotheses.csv", "overlay.mp4", "track.csv"]
 
 
+def test_an_overlay_of_an_earlier_run_is_removed_and_inputs_are_kept(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["track", str(recording / "film.mp4"), "--target", TARGET, "--out", str(tmp_path)]
+    assert run([*arguments, "--overlay"]) == 0
+    assert run([arguments[0], str(tmp_path / "overlay.mp4"), *arguments[2:]]) == 2
+    assert run([*arguments, "--csv-truth", str(tmp_path / "track.csv")]) == 2
+    assert "this file is read, and would be lost" in capsys.readouterr().err
+    assert run(arguments) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hypotheses.csv", "track.csv"]
+
+
 def test_the_same_seed_writes_the_same_bytes(recording: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         assert run(["track", str(recording / "pictures"), "--target", TARGET, "--out", str(tmp_path / name)]) == 0
@@ -218,6 +235,50 @@ def test_telemetry_on_another_clock_or_in_other_units_is_named(
     printed = capsys.readouterr().out
     assert ("warning:" in printed) == bool(warning)
     assert warning in printed
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("flight")
+    write_simulated_flight("town:yaw", folder, seed=5, frames=60, size=(320, 240), rate_hz=20.0)
+    return folder
+
+
+def _scaled(q: Floats) -> Floats:
+    """Of three turns in one, as of another flight."""
+    return so3.quaternion(so3.exp(3.0 * so3.log(so3.from_quaternion(q))))
+
+
+@pytest.mark.parametrize(
+    ("written", "named"),
+    [
+        (lambda q: q, None),
+        (lambda q: np.roll(q, -1), "would if they were x,y,z,w"),
+        (lambda q: q * [1, -1, -1, -1], "would if they were body_from_ned"),
+        (lambda q: so3.quaternion(_ENU @ so3.from_quaternion(q) @ _FLU), "would if they were ROS's enu_from_flu"),
+        (_scaled, "but not as the video does: check body_from_camera"),
+    ],
+)
+def test_attitudes_that_turn_otherwise_than_the_video_are_named(
+    flight: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    written: Callable[[Floats], Floats],
+    named: str | None,
+) -> None:
+    """They were believed, with positions on the ground some 30 m off and stds of 0.1 m."""
+    lines = (flight / "telemetry.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    turned = [",".join([row[0], *map(str, written(np.array(row[1:5], float))), *row[5:]]) for row in rows]
+    (tmp_path / "t.csv").write_text("\n".join([lines[0], *turned]) + "\n")
+    first = {name: float(value) for name, value in table(flight / "truth.csv")[0].items()}
+    box = f"{first['x'] - first['width'] / 2},{first['y'] - first['height'] / 2},{first['width']},{first['height']}"
+    arguments = ["track", str(flight / "video.mp4"), "--target", box, "--rig", str(flight / "rig.toml")]
+    status = run([*arguments, "--telemetry", str(tmp_path / "t.csv"), "--out", str(tmp_path / "out")])
+    printed = capsys.readouterr()
+    assert status == (2 if named is not None and "would" in named else 0)
+    assert ("its attitudes" in printed.out + printed.err) == (named is not None)
+    assert (named or "") in printed.out + printed.err
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])

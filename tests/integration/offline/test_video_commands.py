@@ -378,6 +378,20 @@ def test_a_video_that_cannot_be_read_is_left_out_of_the_synchronised_ones_with_a
     assert "warning: wall.mp4: no observations; left out" in printed  # why the calibration refused it
 
 
+def test_nothing_of_an_earlier_run_is_left_among_the_tables_of_synchronised_videos(
+    recorded: RecordedVideos, tmp_path: Path, capsys: Capture
+) -> None:
+    (tmp_path / "videos").mkdir()
+    shutil.copy(recorded.folder / "cam0.mp4", tmp_path / "videos")
+    out, known = tmp_path / "out", ["--calibration", str(recorded.out / "calibration.toml")]
+    assert run(["sync", str(recorded.folder), *known, "--out", str(out)]) == 0
+    (out / "notes.csv").write_text("my own\n")
+    capsys.readouterr()
+    assert run(["sync", str(tmp_path / "videos"), *known, "--videos", "trim", "--out", str(out)]) == 0
+    assert sorted(file.name for file in out.iterdir()) == ["cam0.csv", "cam0.mp4", "cam1.mp4", "notes.csv"]
+    assert f"warning: {out / 'cam1.mp4'} is of an earlier run" in capsys.readouterr().out
+
+
 def test_nothing_in_a_video_that_is_cut_off_says_that_it_is(tmp_path: Path, capsys: Capture) -> None:
     write_video(tmp_path / "a.mkv", [numbered_image(i) for i in range(80)], np.arange(80) / 10)
     content = (tmp_path / "a.mkv").read_bytes()

@@ -37,3 +37,23 @@ def test_only_the_autopilots_attitudes_and_positions_are_read(tmp_path: Path, ah
     assert last.position is not None
     assert last.position == pytest.approx([99.5, 0.0, -50.0])
     assert math.atan2(last.ned_from_body[1, 0], last.ned_from_body[0, 0]) == pytest.approx(1.99)
+
+
+def test_of_two_kinds_of_attitudes_and_positions_the_more_frequent_is_read(tmp_path: Path) -> None:
+    """A single quaternion, that somebody asked for, left all others unread."""
+    codec, data = mavlink.MAVLink(None, 1, 1), bytearray()
+    for k in range(100):
+        boot_ms = 60_000 + 100 * k
+        messages = [
+            mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0),
+            mavlink.MAVLink_global_position_int_message(boot_ms, 1, 1, 0, 50_000, 0, 0, 0, 0),
+        ]
+        if k in (40, 42):
+            messages.append(mavlink.MAVLink_attitude_quaternion_message(boot_ms, 1, 0, 0, 0, 0, 0, 0))
+            messages.append(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, -7, 0, 0, 0))
+        for message in messages:
+            data += (1_700_000_000_000_000 + 100_000 * k).to_bytes(8, "big") + message.pack(codec)
+    (tmp_path / "a.tlog").write_bytes(data)
+    log = read_tlog(tmp_path / "a.tlog")
+    assert len(log.samples) == 100
+    assert all(one.position is not None and one.position[2] == pytest.approx(-50.0) for one in log.samples)

@@ -74,6 +74,24 @@ class VehicleUnderTest:
         )
 
 
+def test_angles_are_used_between_rare_quaternions_and_positions_of_each_second() -> None:
+    """Of 50 attitudes a second one was used, and no position."""
+    one, samples = VehicleUnderTest(), []
+    for k in range(300):
+        time_s = 0.02 * k
+        if k % 50 == 0:
+            samples += one.attitude(time_s)
+            one.position(time_s)
+        else:
+            samples += one.take(mavlink.MAVLink_attitude_message(boot_ms(time_s), 0, 0, 0, 0, 0, 0), time_s)
+    assert len(samples) > 250
+    assert sum(sample.position is None for sample in samples) <= 1
+    assert one.vehicle.problem(6_000_000_000) == ""
+    for time_s in range(6, 30):
+        one.attitude(time_s)
+    assert "attitudes come at 1.0 Hz" in one.vehicle.problem(29_500_000_000)
+
+
 def boot_ms(time_s: float) -> int:
     return round(1e3 * (time_s + BOOT_S))
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +12,13 @@ import pytest
 from edge.uav.base import Telemetry
 from edge.uav.navigation import Origin
 from edge.uav.timing.clock_alignment import CameraHostClock
-from edge.uav.timing.telemetry_offset import OffsetEstimate, RelativeRotations, find_offset
+from edge.uav.timing.telemetry_offset import CONTRADICTION, OffsetEstimate, RelativeRotations, find_offset
 from edge.uav.timing.telemetry_track import TelemetryTrack
 from edge.uav.timing.vehicle_clock import VehicleClock
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA, Flight, grid_times, rotation
 from edge.uav.world.noise import smoothed_noise
 from protocols.geometry import so3
+from protocols.geometry.types import Floats
 
 SECOND = 1_000_000_000
 
@@ -80,6 +83,20 @@ def test_stamps_of_another_clock_between_the_vehicles_own_never_move_its_clock(e
     assert not any(wrong[3:])
     assert (clock.reboots, clock.steps) == (0, 0)
     assert clock.offset_ns == 500 * SECOND - 5_000_000
+
+
+def test_messages_that_come_late_and_out_of_order_set_no_clock_back() -> None:
+    clock, rng = VehicleClock(), np.random.default_rng(2)
+    stamps = np.arange(600) / 30
+    arrivals = stamps + 0.8 + 0.2 * np.abs(rng.standard_normal(600))
+    trips = 0.0
+    for k in np.argsort(arrivals):
+        while trips < arrivals[k]:  # answered at once
+            clock.handle_round_trip(int(1e9 * trips), int(1e9 * (trips + 100.0)), int(1e9 * trips) + 2_000_000)
+            trips += 0.5
+        assert clock.handle_message(int(1e9 * (stamps[k] + 100.0)), int(1e9 * arrivals[k]))
+    assert (clock.reboots, clock.steps) == (0, 0)
+    assert abs(clock.offset_ns - 100 * SECOND) < 2_000_000
 
 
 def test_an_answer_of_another_clock_to_timesync_is_not_used() -> None:
@@ -232,6 +249,25 @@ def test_without_camera_rotation_the_offset_is_not_observable() -> None:
 def test_an_offset_outside_the_search_window_is_rejected() -> None:
     rotations, telemetry = simulated_rotations_and_telemetry(flight(1, 40.0), 3.0, 30.0)
     assert isinstance(find_offset(rotations, telemetry, BODY_FROM_DOWN_CAMERA, (-0.7, 0.7)), str)
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        (lambda r, m: (r, m), ""),
+        (lambda r, m: (r.T, m), "check body_from_camera"),
+        (lambda r, m: (r, m @ np.diag([-1.0, -1.0, 1.0])), "as of a camera turned by 180 degrees"),
+    ],
+)
+@pytest.mark.parametrize("hz", [30.0, 3.0])
+def test_attitudes_of_another_convention_or_mounting_contradict_the_images(
+    changed: Callable[[Floats, Floats], tuple[Floats, Floats]], named: str, hz: float
+) -> None:
+    rotations, telemetry = simulated_rotations_and_telemetry(flight(1, 40.0), 0.1, hz)
+    other = [replace(one, ned_from_body=changed(one.ned_from_body, np.eye(3))[0]) for one in telemetry]
+    found = find_offset(rotations, other, changed(np.eye(3), BODY_FROM_DOWN_CAMERA)[1], (-0.7, 0.7))
+    assert (isinstance(found, str) and found.startswith(CONTRADICTION)) == bool(named)
+    assert named in str(found)
 
 
 def test_geodetic_conversion_round_trips() -> None:
