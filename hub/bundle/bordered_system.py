@@ -9,7 +9,7 @@ length of the recording (Schur complement C - Bᵀ A⁻¹ B). A label's path mee
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,7 +74,7 @@ class BorderedSystem:
 
 
 class PathBlocks:
-    """Accumulates rows into the band and the border of the trajectory block; size: number of control points.
+    """Accumulates rows of one label into the band of the trajectory block; size: number of control points.
 
     A row depends on four control points. Sums over rows are products with a sparse matrix of their weights; the band is
     assembled once, from sums for each first control point.
@@ -82,19 +82,10 @@ class PathBlocks:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._sums: Floats = np.zeros(((size + SUPPORT) * len(_PAIRS), 6))
+        self.sums: Floats = np.zeros(((size + SUPPORT) * len(_PAIRS), 6))
 
-    def add_rows(self, index: Ints, weights: Floats, terms: Floats) -> tuple[Floats, Floats]:
-        """Add the rows' normal matrix; returns its path-by-others block (3 size, p) and others-by-others block (p, p).
-
-        terms: (2, 3 + p, n) derivatives of both image axes by the point and by p other columns (the residual may be
-        one), times the root of the rows' weights. index (n,), weights (n, 4): control points of each row.
-        """
-        others = terms.shape[1] - 3
-        crossed, gram = np.zeros((self.size + SUPPORT, 3 * others)), np.zeros((others, others))
-        if kernels.AVAILABLE and others <= kernels.MOST_TERMS:
-            kernels.add_rows(index, weights.T, terms, self._sums, crossed, gram)
-            return crossed.reshape(-1, others)[: 3 * self.size], gram
+    def add(self, index: Ints, weights: Floats, terms: Floats, crossed: tuple[int, Floats], gram: Floats) -> None:
+        """Add rows (n,) of this label; ``crossed``: from a control point on (k, 3 p), and ``gram`` (p, p)."""
         for first in range(0, len(index), _ROWS_AT_ONCE):
             rows = slice(first, first + _ROWS_AT_ONCE)
             u, v = terms[:, :, rows]
@@ -102,23 +93,52 @@ class PathBlocks:
             products = u[:3, None] * u
             products += v[:3, None] * v
             add_row_sums(
-                crossed, weights[rows], index[rows, None] + _SUPPORT, products[:, 3:].reshape(-1, u.shape[1]).T
+                crossed[1],
+                weights[rows],
+                index[rows, None] - crossed[0] + _SUPPORT,
+                products[:, 3:].reshape(-1, u.shape[1]).T,
             )
             pairs = weights[rows].T[_PAIR_FIRST] * weights[rows].T[_PAIR_SECOND]
             columns = len(_PAIRS) * index[rows, None] + _PAIR_COLUMNS
-            add_row_sums(self._sums, pairs.T, columns, products[_ROWS, _COLUMNS].T)
+            add_row_sums(self.sums, pairs.T, columns, products[_ROWS, _COLUMNS].T)
             gram += u[3:] @ u[3:].T + v[3:] @ v[3:].T
-        return crossed.reshape(-1, others)[: 3 * self.size], gram
 
     def band(self) -> Floats:
         """The band (12, 3 size) of the sum of all rows."""
-        out, all_sums = np.zeros((BAND, 3 * self.size)), self._sums.reshape(-1, len(_PAIRS), 6)
+        out, all_sums = np.zeros((BAND, 3 * self.size)), self.sums.reshape(-1, len(_PAIRS), 6)
         for p, (a, b) in enumerate(_PAIRS):
             for i in range(3):
                 for j in range(i if a == b else 0, 3):
                     values = all_sums[: self.size - b, p, _UPPER[i][j]]
                     out[BAND - 1 - 3 * (b - a) - j + i, 3 * b + j :: 3] += values
         return out
+
+
+def add_rows(
+    to: Sequence[tuple[int, PathBlocks]], ends: Ints, index: Ints, weights: Floats, terms: Floats
+) -> tuple[list[tuple[int, Floats]], Floats]:
+    """Add rows (n,) to the normal matrix; returns others-by-others (p, p), and path-by-others of each label: the first
+    control point that it observes, and the block (3 k, p) from there to the last one.
+
+    to: of each label its first control point and what accumulates it. ends: where its rows end. terms: (2, 3 + p, n)
+    derivatives of both image axes by the point and by p other columns (the residual may be one), times the root of the
+    rows' weights. index (n,), weights (n, 4): control points of each row.
+    """
+    others, parts = terms.shape[1] - 3, list[tuple[int, Floats]]()
+    bounds = [(int(begin), int(end)) for begin, end in zip((0, *ends[:-1]), ends, strict=True)]
+    for (first, _), (begin, end) in zip(to, bounds, strict=True):
+        seen = index[begin:end] if end > begin else np.array([first])
+        low = int(seen.min())
+        parts.append((low, np.zeros((int(seen.max()) - low + SUPPORT, 3 * others))))
+    gram = np.zeros((others, others))
+    if kernels.AVAILABLE and others <= kernels.MOST_TERMS:
+        sums = [(first, one.sums, *part) for (first, one), part in zip(to, parts, strict=True)]
+        kernels.add_rows(ends, index, weights.T, terms, sums, gram)
+    else:
+        for (first, one), (low, block), (begin, end) in zip(to, parts, bounds, strict=True):
+            rows = slice(begin, end)
+            one.add(index[rows] - first, weights[rows], terms[:, :, rows], (low - first, block), gram)
+    return [(low, block.reshape(-1, others)) for low, block in parts], gram
 
 
 _SUPPORT = np.arange(SUPPORT, dtype=np.int32)

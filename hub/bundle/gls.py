@@ -15,12 +15,19 @@ import numpy as np
 
 from hub.bundle.adjustment import apply_step, gauge
 from hub.bundle.block_matrix import BlockSum, ParameterCovariance
-from hub.bundle.bordered_system import PathBlocks, add_row_sums
+from hub.bundle.bordered_system import PathBlocks, add_row_sums, add_rows
 from hub.bundle.covariance import constrained_step
 from hub.bundle.datum.gauge import ControlPointTerms
 from hub.bundle.noise.gauss_markov import GaussMarkov
 from hub.bundle.normal_equations import camera_priors, prior_terms
-from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, CorrelatedNoise, Problem, TrackObservations
+from hub.bundle.problem import (
+    CAMERA_PARAMETERS,
+    AdjustmentState,
+    CorrelatedNoise,
+    Problem,
+    TrackObservations,
+    UsedRows,
+)
 from hub.bundle.residuals import evaluate_residuals, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, smoothness_cost, smoothness_terms
 from hub.trajectory.banded import cho_solve_banded, cholesky_banded
@@ -171,7 +178,7 @@ def _noise_block(rows: TrackObservations, count: int, noise: CorrelatedNoise) ->
     # Between two knots the process deviates from the line: mean variance of the bridge.
     width, correlated_std = float(knots[1] - knots[0]), float(noise.correlated_std[rows.camera])
     bridge_variance = correlated_std**2 * min(width / (3.0 * float(noise.time_constant[rows.camera])), 1.0)
-    white_variance = float(noise.white_std[rows.camera]) ** 2 * rows.used_relative_std**2
+    white_variance = float(noise.white_std[rows.camera]) ** 2 / UsedRows.of([rows]).relative_information
     white_information = 1.0 / (white_variance + bridge_variance)
     precision = GaussMarkov.sampled_at(knots, float(noise.time_constant[rows.camera])).precision() / correlated_std**2
     both = precision + _knot_information(interval, knot_weights, white_information, count)
@@ -244,9 +251,13 @@ def _step(
         terms = np.concatenate([jacobian, evaluation.residual[:, None]], axis=1)
         weight = np.where(evaluation.valid, part.white_information, 0.0)
         weighted = terms * weight
-        path_terms, camera_terms = blocks.add_rows(index, evaluation.weights, terms * np.sqrt(weight))
-        border[:paths, camera_columns] += path_terms[:, :-1]
-        gradient[:paths] += path_terms[:, -1]
+        ends = np.array([len(index)])
+        ((low, path_terms),), camera_terms = add_rows(
+            [(0, blocks)], ends, index, evaluation.weights, terms * np.sqrt(weight)
+        )
+        observed = slice(3 * low, 3 * low + len(path_terms))
+        border[observed, camera_columns] += path_terms[:, :-1]
+        gradient[observed] += path_terms[:, -1]
         corner[np.ix_(camera_columns, camera_columns)] += camera_terms[:-1, :-1]
         camera_gradient[camera_columns] += camera_terms[:-1, -1]
         gram = part.precision + _knot_information(part.interval, part.knot_weights, weight, len(part.knots))

@@ -135,9 +135,9 @@ class LinearisedModel:
         """The best of a camera's steps at camera times (k,); what the paths (m,) and the cameras (p,) do with it."""
         state, system, columns = self.state, self.system, self.problem.free_columns
         seen = evaluate_labels(
-            self.problem.of_camera(camera),
+            self.problem.used[camera],
             state.cameras[camera],
-            StackedTrajectories.of(state.trajectories),
+            StackedTrajectories.of(state.by_label),
         )
         mine = np.flatnonzero(columns // CAMERA_PARAMETERS == camera)
         own = (columns[mine] % CAMERA_PARAMETERS).tolist()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate
 
 import numpy as np
 
 from hub.bundle.block_matrix import BlockSum
-from hub.bundle.bordered_system import BAND, BorderedSystem, PathBlocks, PathByCameras
+from hub.bundle.bordered_system import BAND, BorderedSystem, PathBlocks, PathByCameras, add_rows
 from hub.bundle.problem import (
     ASPECT,
     CAMERA_PARAMETERS,
@@ -52,10 +52,10 @@ def weigh_residuals(
     cost += sum((value / std) ** 2 for _, value, std in camera_priors(problem, state))
     # A point behind the camera or off the path costs as much as a gross outlier, and has no gradient.
     gross_error_cost = CAUCHY_WIDTH**2 * np.log1p((100.0 / CAUCHY_WIDTH) ** 2) if robust else 100.0**2
-    paths = StackedTrajectories.of(state.trajectories)
+    paths = StackedTrajectories.of(state.by_label)
     evaluations, weights = [], []
-    for camera, parts in problem.by_camera.items():
-        residuals = evaluate_labels(parts, state.cameras[camera], paths)
+    for camera, rows in problem.used.items():
+        residuals = evaluate_labels(rows, state.cameras[camera], paths)
         information = residuals.relative_information / state.sigma[camera] ** 2
         squared = np.square(residuals.whitened(residuals.residual)).sum(axis=0) * information
         if robust:
@@ -67,7 +67,7 @@ def weigh_residuals(
             losses = squared
         cost += float(np.where(residuals.valid, losses, gross_error_cost).sum())
         evaluations.append(residuals)
-    return WeightedResiduals(tuple(problem.by_camera), tuple(evaluations), tuple(weights), float(cost))
+    return WeightedResiduals(tuple(problem.used), tuple(evaluations), tuple(weights), float(cost))
 
 
 def build_system(
@@ -87,37 +87,34 @@ def assemble(
     corner, gradient_cameras = list[tuple[Ints, Floats]](), np.zeros(len(columns))
     band, gradient_path = np.zeros((BAND, first_rows[-1])), np.zeros(first_rows[-1])
     blocks = [PathBlocks(path.basis.size) for path in state.trajectories]
-    border: list[dict[int, Floats]] = [{} for _ in blocks]
-    columns_of = {camera: np.flatnonzero(columns // CAMERA_PARAMETERS == camera) for camera in residuals.cameras}
+    border: list[list[tuple[int, int, Floats]]] = [[] for _ in blocks]
+    starts = np.searchsorted(columns, CAMERA_PARAMETERS * np.arange(len(state.cameras) + 1))
+    columns_of = {camera: np.arange(starts[camera], starts[camera + 1]) for camera in residuals.cameras}
     for camera, one, weight in zip(residuals.cameras, residuals.evaluations, residuals.weights, strict=True):
-        own = columns_of[camera]
-        of_camera = np.zeros((len(own), len(own)))
-        corner.append((own, of_camera))
+        own, rows = columns_of[camera], problem.used[camera]
         jacobian = jacobians(one, state.cameras[camera], (columns[own] % CAMERA_PARAMETERS).tolist())
-        residual = one.whitened(one.residual)
-        root, labels = np.sqrt(weight), np.searchsorted(first_rows, 3 * one.index, side="right") - 1
-        edges = [0, *(np.flatnonzero(np.diff(labels)) + 1).tolist(), len(labels)]
-        for begin, end in pairwise(edges) if len(labels) else ():
-            label, part = int(labels[begin]), slice(begin, end)
-            terms = np.empty((2, jacobian.shape[1] + 1, end - begin))
-            np.multiply(jacobian[:, :, part], root[part], out=terms[:, :-1])
-            np.multiply(residual[:, part], root[part], out=terms[:, -1])
-            index = one.index[part] - first_rows[label] // 3
-            path_terms, camera_terms = blocks[label].add_rows(index, one.weights[part], terms)
-            gradient_path[first_rows[label] : first_rows[label + 1]] += path_terms[:, -1]
-            before = border[label].get(camera)
-            border[label][camera] = path_terms[:, :-1] if before is None else before + path_terms[:, :-1]
-            of_camera += camera_terms[:-1, :-1]
-            gradient_cameras[own] += camera_terms[:-1, -1]
+        terms = np.concatenate([jacobian, one.whitened(one.residual)[:, None]], axis=1)
+        terms *= np.sqrt(weight)
+        to = [(int(first_rows[label]) // 3, blocks[label]) for label in rows.labels]
+        path_terms, camera_terms = add_rows(to, rows.ends, one.index, one.weights, terms)
+        for label, (low, of_label) in zip(rows.labels, path_terms, strict=True):
+            gradient_path[3 * low : 3 * low + len(of_label)] += of_label[:, -1]
+            border[label].append((camera, low, of_label[:, :-1]))
+        corner.append((own, camera_terms[:-1, :-1]))
+        gradient_cameras[own] += camera_terms[:-1, -1]
     parts = []
     for label, path in enumerate(state.trajectories):
         rows_of_label = slice(int(first_rows[label]), int(first_rows[label + 1]))
         of_prior, gradient, _ = smoothness_terms(path, *prior.of(label))
         band[:, rows_of_label] = blocks[label].band() + of_prior
         gradient_path[rows_of_label] += gradient
-        seeing = [np.zeros(0, dtype=np.int64), *(columns_of[camera] for camera in border[label])]
-        block = np.concatenate([np.zeros((len(gradient), 0)), *border[label].values()], axis=1)
-        parts.append((rows_of_label, np.concatenate(seeing), block))
+        seeing = {camera: columns_of[camera] for camera, _, _ in border[label]}
+        place = dict(zip(seeing, accumulate((len(one) for one in seeing.values()), initial=0), strict=False))
+        block = np.zeros((len(gradient), sum(len(one) for one in seeing.values())))
+        for camera, low, of_label in border[label]:
+            at, column = 3 * low - rows_of_label.start, place[camera]
+            block[at : at + len(of_label), column : column + of_label.shape[1]] += of_label
+        parts.append((rows_of_label, np.concatenate([np.zeros(0, dtype=np.int64), *seeing.values()]), block))
     priors, gradient = prior_terms(problem, state)
     return BorderedSystem(
         band,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -103,11 +103,6 @@ class TrackObservations:
             relative_std=None if self.relative_std is None else self.relative_std[part],
         )
 
-    @property
-    def used_relative_std(self) -> Floats:
-        """Relative stds of the rows in use."""
-        return np.ones(int(np.count_nonzero(self.use))) if self.relative_std is None else self.relative_std[self.use]
-
     def renumbered(self, camera: int, label: int) -> TrackObservations:
         """The same rows with other indices, in half of the time of `replace`: networks grow camera by camera."""
         return TrackObservations(
@@ -117,6 +112,43 @@ class TrackObservations:
     def using(self, use: Bools) -> TrackObservations:
         """The same rows with another inlier mask."""
         return replace(self, use=use)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UsedRows:
+    """The rows in use of several labels of one camera, concatenated; the same at every state.
+
+    A calibration board gives some thirty rows a label: numpy takes as long for one label as for all at once. labels,
+    ends: of each part, and where its rows end. time (n,), pixels (n, 2). relative_information: (n,). along_std: (n,),
+    None = all alike.
+    """
+
+    labels: tuple[int, ...]
+    ends: Ints
+    time: Floats
+    pixels: Floats
+    relative_information: Floats
+    along_std: Floats | None
+
+    @classmethod
+    def of(cls, parts: Sequence[TrackObservations]) -> UsedRows:
+        """The rows in use of parts of one camera."""
+        parts = [part for part in parts if part.use.any()] or parts[:1]
+        used = [np.flatnonzero(part.use) for part in parts]
+
+        def stacked(values: Iterable[Floats | None]) -> Floats:
+            each = zip(values, used, strict=True)
+            return np.concatenate([np.ones(len(at)) if one is None else one.take(at, axis=0) for one, at in each])
+
+        alike = all(part.along_std is None for part in parts)
+        return cls(
+            tuple(part.label for part in parts),
+            np.cumsum([len(rows) for rows in used], dtype=np.int64),
+            stacked(part.time for part in parts),
+            stacked(part.pixels for part in parts),
+            1.0 / np.square(stacked(part.relative_std for part in parts)),
+            None if alike else stacked(part.along_std for part in parts),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,6 +210,11 @@ class AdjustmentState:
     correlated_noise: CorrelatedNoise | None = None
     clock_steps: tuple[ClockStep, ...] = ()
     wanders: tuple[Wander, ...] = ()
+
+    @property
+    def by_label(self) -> dict[int, Trajectory]:
+        """The path of each label."""
+        return dict(enumerate(self.trajectories))
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,6 +295,11 @@ class Problem:
     def by_label(self) -> dict[int, tuple[TrackObservations, ...]]:
         """The observations of each label that has any, in the order of the rows."""
         return _grouped(self.rows, lambda rows: rows.label)
+
+    @cached_property
+    def used(self) -> dict[int, UsedRows]:
+        """The rows in use of each camera that has any observations."""
+        return {camera: UsedRows.of(parts) for camera, parts in self.by_camera.items()}
 
     def of_camera(self, camera: int) -> tuple[TrackObservations, ...]:
         """The observations by one camera."""

@@ -6,7 +6,7 @@ get transposed views, rows first.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 
@@ -27,8 +27,10 @@ from hub.bundle.problem import (
     CameraState,
     TrackObservations,
     Trajectory,
+    UsedRows,
 )
-from hub.trajectory.splines import weighted_sums
+from hub.trajectory.discrete import PointBasis
+from hub.trajectory.splines import SplineBasis, weighted_sums
 from protocols.geometry import kernels
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Bools, Floats, Ints
@@ -100,17 +102,38 @@ class SplineSupport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StackedTrajectories:
-    """The paths of all labels, concatenated. offsets: index of each label's first point in ``control`` (size, 3)."""
+    """The paths of labels, concatenated: of each label its basis and the index of its first point in ``control``
+    (size, 3). are_splines: all of them."""
 
-    paths: tuple[Trajectory, ...]
-    offsets: tuple[int, ...]
+    bases: dict[int, tuple[SplineBasis | PointBasis, int]]
     control: Floats
+    are_splines: bool
 
     @classmethod
-    def of(cls, paths: tuple[Trajectory, ...]) -> StackedTrajectories:
-        """All paths of a state."""
-        offsets = accumulate((path.basis.size for path in paths), initial=0)
-        return cls(paths, tuple(offsets)[:-1], np.concatenate([np.zeros((0, 3)), *(path.control for path in paths)]))
+    def of(cls, paths: Mapping[int, Trajectory]) -> StackedTrajectories:
+        """Paths by label."""
+        firsts = accumulate((path.basis.size for path in paths.values()), initial=0)
+        bases = {label: (path.basis, first) for (label, path), first in zip(paths.items(), firsts, strict=False)}
+        control = np.concatenate([np.zeros((0, 3)), *(path.control for path in paths.values())])
+        splines = all(isinstance(path.basis, SplineBasis) and len(path.basis.starts) for path in paths.values())
+        return cls(bases, control, splines)
+
+    def support(self, rows: UsedRows, time: Floats) -> tuple[Ints, Floats, Floats, Bools]:
+        """Of rows at reference time (n,): first control points (n,), their weights and those of the slopes (n, 4), and
+        whether the paths are defined there (n,)."""
+        bases = [self.bases[label] for label in rows.labels]
+        if kernels.AVAILABLE and self.are_splines:
+            tables = [(basis.table, first) for basis, first in bases if isinstance(basis, SplineBasis)]
+            index, weights, slopes, inside = kernels.label_weights(tables, rows.ends, time, _EXTRAPOLATION_INTERVALS)
+            return index, weights.T, slopes.T, inside
+        times = np.split(time, rows.ends[:-1])
+        found = [
+            basis.weights_and_derivatives(at, _EXTRAPOLATION_INTERVALS)
+            for (basis, _), at in zip(bases, times, strict=True)
+        ]
+        index = np.concatenate([one[0] + first for one, (_, first) in zip(found, bases, strict=True)])
+        weights, slopes, inside = (np.concatenate(one) for one in list(zip(*found, strict=True))[1:])
+        return index, weights, slopes, inside
 
 
 def predict(rows: TrackObservations, camera: CameraState, path: Trajectory) -> Floats:
@@ -128,44 +151,21 @@ def residual_norms(rows: TrackObservations, camera: CameraState, path: Trajector
 
 def evaluate_residuals(rows: TrackObservations, camera: CameraState, path: Trajectory) -> ResidualEvaluation:
     """Residuals of the used rows of one label, and what their Jacobians need."""
-    return evaluate_labels((replace(rows, label=0),), camera, StackedTrajectories((path,), (0,), path.control))
+    return evaluate_labels(UsedRows.of([rows]), camera, StackedTrajectories.of({rows.label: path}))
 
 
-def evaluate_labels(
-    parts: Sequence[TrackObservations], camera: CameraState, paths: StackedTrajectories
-) -> ResidualEvaluation:
-    """Residuals of the used rows of several labels of one camera, concatenated.
-
-    A calibration board gives some thirty rows a label: numpy takes as long for one label as for all at once.
-    """
-    used = [np.flatnonzero(part.use) for part in parts]
-    pixels = np.concatenate([part.pixels.take(rows, axis=0) for part, rows in zip(parts, used, strict=True)])
-    time = np.concatenate([part.time.take(rows) for part, rows in zip(parts, used, strict=True)])
-    time = camera.row_time(time, pixels)
-    reference = camera.reference_time(time)
-    ends = np.cumsum([len(rows) for rows in used])
-    supports = [
-        paths.paths[part.label].basis.weights_and_derivatives(part_times, _EXTRAPOLATION_INTERVALS)
-        for part, part_times in zip(parts, np.split(reference, ends[:-1]), strict=True)
-    ]
-    index = np.concatenate(
-        [support[0] + paths.offsets[part.label] for support, part in zip(supports, parts, strict=True)]
-    )
-    weights, slope_weights = (np.concatenate([support[i] for support in supports]) for i in (1, 2))
-    inside = np.concatenate([support[3] for support in supports])
+def evaluate_labels(rows: UsedRows, camera: CameraState, paths: StackedTrajectories) -> ResidualEvaluation:
+    """Residuals of the used rows of several labels of one camera."""
+    time = camera.row_time(rows.time, rows.pixels)
+    index, weights, slope_weights, inside = paths.support(rows, camera.reference_time(time))
     points = weighted_sums(paths.control, index, weights)
-    information = 1.0 / np.square(np.concatenate([part.used_relative_std for part in parts]))
     support = SplineSupport(paths.control, index, weights, slope_weights)
-    evaluation = evaluate_points(camera, points, inside, time, pixels, support, information)
-    if all(part.along_std is None for part in parts):
+    evaluation = evaluate_points(camera, points, inside, time, rows.pixels, support, rows.relative_information)
+    if rows.along_std is None:
         return evaluation
     velocity = jacobians(evaluation, camera, [OFFSET])[:, 3]
     direction = velocity / np.maximum(np.linalg.norm(velocity, axis=0), 1e-9)
-    wider = [
-        np.ones(len(rows)) if part.along_std is None else part.along_std[rows]
-        for part, rows in zip(parts, used, strict=True)
-    ]
-    return replace(evaluation, along=(direction, 1.0 / np.concatenate(wider)))
+    return replace(evaluation, along=(direction, 1.0 / rows.along_std))
 
 
 def evaluate_points(

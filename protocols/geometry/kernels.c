@@ -49,14 +49,16 @@ static int locate(const double *basis, integer stretches, double time, double ex
     return inside;
 }
 
-/* SplineBasis.weights_and_derivatives: index (n,), weights and, unless null, slopes (4, n), inside (n,). */
-void spline_weights(integer n, const double *time, integer stretches, const double *basis, double extrapolation,
-                    integer *index, double *weights, double *slopes, uint8_t *inside)
+/* Rows from begin to end of n. */
+static INLINE void weights_of_rows(integer begin, integer end, integer n, const double *time, integer stretches,
+                                   const double *basis, integer first, double extrapolation, integer *index,
+                                   double *weights, double *slopes, uint8_t *inside)
 {
     integer hint = 0;
-    for (integer i = 0; i < n; i++) {
+    for (integer i = begin; i < end; i++) {
         double u, width;
         inside[i] = (uint8_t)locate(basis, stretches, time[i], extrapolation, &hint, index + i, &u, &width);
+        index[i] += first;
         double v = 1.0 - u, square = u * u, cube = square * u;
         weights[i] = v * v * v * SIXTH;
         weights[n + i] = (3 * cube - 6 * square + 4) * SIXTH;
@@ -69,6 +71,23 @@ void spline_weights(integer n, const double *time, integer stretches, const doub
         slopes[2 * n + i] = (-9 * square + 6 * u + 3) * over;
         slopes[3 * n + i] = 3 * square * over;
     }
+}
+
+/* SplineBasis.weights_and_derivatives: index (n,), weights and, unless null, slopes (4, n), inside (n,). */
+void spline_weights(integer n, const double *time, integer stretches, const double *basis, double extrapolation,
+                    integer *index, double *weights, double *slopes, uint8_t *inside)
+{
+    weights_of_rows(0, n, n, time, stretches, basis, 0, extrapolation, index, weights, slopes, inside);
+}
+
+/* The same for several labels, whose rows end at ends. tables: of each its basis, the stretches of it and the first
+   control point. */
+void label_weights(integer n, const double *time, integer labels, const integer *ends, const integer *tables,
+                   double extrapolation, integer *index, double *weights, double *slopes, uint8_t *inside)
+{
+    for (integer k = 0, begin = 0; k < labels; begin = ends[k++], tables += 3)
+        weights_of_rows(begin, ends[k], n, time, tables[1], (const double *)tables[0], tables[2], extrapolation, index,
+                        weights, slopes, inside);
 }
 
 /* SplineBasis.evaluate_with_derivatives: polynomials (4, d, m); values, slopes (d, n). */
@@ -128,34 +147,41 @@ void spline_normal(integer n, const integer *index, const double *weights, const
     for (integer j = 0; j < size; j++) bands[3 * size + j] += 1e-12;
 }
 
-/* hub.bundle.bordered_system.PathBlocks.add_rows: weights (4, n), terms (2, 3 + p, n), p at most 21; added to sums
-   ((size + 4) * 10, 6), to crossed (size + 4, 3, p) and to gram (p, p). */
-WIDE void add_rows(integer n, const integer *index, const double *weights, integer p, const double *terms,
-                   double *sums, double *crossed, double *gram)
+/* hub.bundle.bordered_system.add_rows: index (n,), weights (4, n), terms (2, 3 + p, n), p at most 21, of several labels
+   whose rows end at ends. tables: of each its first control point and sums ((size + 4) * 10, 6), and the first one
+   observed and crossed (k, 3, p) from there, to which it is added. All are added to gram (p, p). */
+WIDE void add_rows(integer labels, const integer *tables, const integer *ends, const integer *index,
+                   const double *weights, integer p, const double *terms, double *gram)
 {
     enum { MOST = 24 };
-    const integer width = 3 + p;
-    for (integer i = 0; i < n; i++) {
-        double u[MOST], v[MOST], products[3][MOST];
-        for (integer c = 0; c < width; c++) {
-            u[c] = terms[c * n + i];
-            v[c] = terms[(width + c) * n + i];
-        }
-        for (int r = 0; r < 3; r++)
-            for (integer c = 0; c < width; c++) products[r][c] = u[r] * u[c] + v[r] * v[c];
-        double upper[6] = {products[0][0], products[0][1], products[0][2], products[1][1], products[1][2], products[2][2]};
-        double *of_pair = sums + 60 * index[i];
-        for (int a = 0; a < 4; a++) {
-            double weight = weights[a * n + i], *to = crossed + (index[i] + a) * 3 * p;
-            for (int r = 0; r < 3; r++)
-                for (integer c = 0; c < p; c++) to[r * p + c] += weight * products[r][3 + c];
-            for (int b = a; b < 4; b++, of_pair += 6) {
-                double both = weight * weights[b * n + i];
-                for (int k = 0; k < 6; k++) of_pair[k] += both * upper[k];
+    const integer width = 3 + p, n = labels ? ends[labels - 1] : 0;
+    for (integer k = 0, i = 0; k < labels; k++, tables += 4) {
+        double *sums = (double *)tables[1], *crossed = (double *)tables[3], own[(MOST - 3) * (MOST - 3)] = {0.0};
+        for (; i < ends[k]; i++) {
+            double u[MOST], v[MOST], products[3][MOST];
+            const integer seen = index[i] - tables[2];
+            for (integer c = 0; c < width; c++) {
+                u[c] = terms[c * n + i];
+                v[c] = terms[(width + c) * n + i];
             }
+            for (int r = 0; r < 3; r++)
+                for (integer c = 0; c < width; c++) products[r][c] = u[r] * u[c] + v[r] * v[c];
+            double upper[6] = {products[0][0], products[0][1], products[0][2],
+                               products[1][1], products[1][2], products[2][2]};
+            double *of_pair = sums + 60 * (index[i] - tables[0]);
+            for (int a = 0; a < 4; a++) {
+                double weight = weights[a * n + i], *to = crossed + (seen + a) * 3 * p;
+                for (int r = 0; r < 3; r++)
+                    for (integer c = 0; c < p; c++) to[r * p + c] += weight * products[r][3 + c];
+                for (int b = a; b < 4; b++, of_pair += 6) {
+                    double both = weight * weights[b * n + i];
+                    for (int j = 0; j < 6; j++) of_pair[j] += both * upper[j];
+                }
+            }
+            for (integer r = 0; r < p; r++)
+                for (integer c = 0; c < p; c++) own[r * p + c] += u[3 + r] * u[3 + c] + v[3 + r] * v[3 + c];
         }
-        for (integer r = 0; r < p; r++)
-            for (integer c = 0; c < p; c++) gram[r * p + c] += u[3 + r] * u[3 + c] + v[3 + r] * v[3 + c];
+        for (integer j = 0; j < p * p; j++) gram[j] += own[j];
     }
 }
 

@@ -19,10 +19,11 @@ from protocols.geometry.types import Bools, Floats, Ints, Singles
 _KINDS = {"n": c_int64, "d": c_double, "p": c_void_p}
 _SIGNATURES = {
     "spline_weights": "npnpdpppp",
+    "label_weights": "npnppdpppp",
     "spline_values": "npnpnnppp",
     "weighted_sums": "nnpppp",
     "spline_normal": "npppnpnpdnpp",
-    "add_rows": "nppnpppp",
+    "add_rows": "nppppnpp",
     "brown_distortion": "npppp",
     "project_points": "npppppdppppp",
     "pose_jacobians": "nppppppppnpp",
@@ -84,6 +85,22 @@ def spline_weights(
     return index, weights, derivatives, inside
 
 
+def label_weights(
+    bases: Sequence[tuple[Floats, int]], ends: Ints, time: Floats, extrapolation: float
+) -> tuple[Ints, Floats, Floats, Bools]:
+    """What `spline_weights` gives for the rows (n,) of several labels, with all control points in one vector.
+
+    bases: of each label the basis (4, stretches) and its first control point. ends: (labels,) where their rows end.
+    """
+    time, count = np.ascontiguousarray(time, dtype=np.float64), len(time)
+    index, inside = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.bool_)
+    weights, slopes = np.empty((2, 4, count))
+    tables = np.array([(_at(one), one.shape[1], first) for one, first in bases], dtype=np.int64)
+    to = _at(index), _at(weights), _at(slopes), _at(inside)
+    _library.label_weights(count, _at(time), len(ends), _at(ends), _at(tables), extrapolation, *to)
+    return index, weights, slopes, inside
+
+
 def spline_values(basis: Floats, time: Floats, polynomials: Floats) -> tuple[Floats, Floats]:
     """Values and slopes (d, n) at time (n,); NaN outside. polynomials: (4, d, m)."""
     time, (_, width, size) = np.ascontiguousarray(time, dtype=np.float64), polynomials.shape
@@ -123,12 +140,24 @@ MOST_TERMS = 21
 """Columns beside the point's that `add_rows` takes: the parameters of a camera and the residual."""
 
 
-def add_rows(index: Ints, weights: Floats, terms: Floats, sums: Floats, crossed: Floats, gram: Floats) -> None:
-    """Add rows to the sums of `hub.bundle.bordered_system.PathBlocks`. weights: (4, n). terms: (2, 3 + p, n)."""
+def add_rows(
+    ends: Ints,
+    index: Ints,
+    weights: Floats,
+    terms: Floats,
+    to: Sequence[tuple[int, Floats, int, Floats]],
+    gram: Floats,
+) -> None:
+    """Add rows (n,) of several labels to the sums of `hub.bundle.bordered_system.add_rows`.
+
+    ends: (labels,) where their rows end. weights: (4, n). terms: (2, 3 + p, n). to: of each label its
+    first control point and the sums over pairs, the first one observed and the sums with the other columns from there.
+    """
     index, weights = np.ascontiguousarray(index, dtype=np.int64), np.ascontiguousarray(weights)
     terms, width = np.ascontiguousarray(terms), terms.shape[1] - 3
-    to = _at(sums), _at(crossed), _at(gram)
-    _library.add_rows(len(index), _at(index), _at(weights), width, _at(terms), *to)
+    tables = np.array([(first, _at(sums), low, _at(crossed)) for first, sums, low, crossed in to], dtype=np.int64)
+    given = _at(ends), _at(index), _at(weights), width, _at(terms)
+    _library.add_rows(len(ends), _at(tables), *given, _at(gram))
 
 
 def brown_distortion(normalised: Floats, coefficients: Floats) -> tuple[Floats, Floats]:

@@ -26,6 +26,7 @@ from hub.bundle.problem import (
     FreeParameters,
     Problem,
     TrackObservations,
+    UsedRows,
 )
 from hub.bundle.residuals import (
     StackedTrajectories,
@@ -100,7 +101,7 @@ def _over_redundancy(
 ) -> Floats:
     """Noise (cameras,) of residual stds, given how many coordinates of each camera are absorbed beside those found."""
     coordinates, absorbed = np.zeros(len(noise)), absorbed.copy()
-    paths, nothing = StackedTrajectories.of(state.trajectories), np.zeros((0, 0))
+    paths, nothing = StackedTrajectories.of(state.by_label), np.zeros((0, 0))
     # The cameras' share differs from label to label.
     groups = problem.by_label.values() if len(found.columns) else problem.by_camera.values()
     for group in groups:
@@ -184,7 +185,7 @@ def _hat_matrix_trace(
         return 0.0
     number = picked[0].camera
     columns = CAMERA_PARAMETERS if len(found.columns) else 0
-    seen = evaluate_labels(picked, state.cameras[number], paths)
+    seen = evaluate_labels(UsedRows.of(picked), state.cameras[number], paths)
     jacobian = jacobians(seen, state.cameras[number], range(columns))
     jacobian *= np.where(seen.valid, np.sqrt(seen.relative_information), 0.0) / float(state.sigma[number])
     jacobian = jacobian.transpose(2, 0, 1)

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 def candidate_pairs(
     prepared: PreparedSession, arrivals: Mapping[str, ExternalClockPrior] | None
 ) -> list[tuple[str, str]]:
-    """Pairs to solve, in the rig's order: all, or in a large network those whose tracks overlap by their clock priors.
+    """Pairs to solve: all in the rig's order, or in a large network those whose tracks overlap by their clock priors,
+    the longest overlap first.
 
     A camera without a prior may overlap with every other. On a shared clock no pair is scanned, so none is left out.
     """
@@ -37,17 +38,17 @@ def candidate_pairs(
     if len(names) <= LARGE_NETWORK or prepared.shared_clock or not any(known):
         return [(names[a], names[b]) for a, b in every]
     seconds = _overlaps(prepared, arrivals or {})
-    chosen, least = set[tuple[int, int]](), PairSettings().min_scan_support
+    chosen, least = dict[tuple[int, int], float](), PairSettings().min_scan_support
     for camera in range(len(names)):
         row = slice(seconds.indptr[camera], seconds.indptr[camera + 1])
         # Of equal overlaps the next in the rig's order, so that not all choose the same.
         after = (seconds.indices[row] - camera) % len(names)
         partners = zip(-seconds.data[row], after, seconds.indices[row], strict=True)
-        enough = [other for less, _, other in sorted(partners) if other != camera and -less >= least]
-        chosen |= {(min(camera, other), max(camera, other)) for other in enough[:MOST_PARTNERS]}
+        enough = [(less, other) for less, _, other in sorted(partners) if other != camera and -less >= least]
+        chosen |= {(min(camera, other), max(camera, other)): less for less, other in enough[:MOST_PARTNERS]}
     unknown = [camera for camera, one in enumerate(known) if not one]
-    chosen |= {(min(a, b), max(a, b)) for a in unknown for b in range(len(names)) if a != b}
-    return [(names[a], names[b]) for a, b in sorted(chosen)]
+    chosen |= {(min(a, b), max(a, b)): 0.0 for a in unknown for b in range(len(names)) if a != b}
+    return [(names[a], names[b]) for a, b in sorted(chosen, key=lambda both: (chosen[both], both))]
 
 
 def _overlaps(prepared: PreparedSession, clocks: Mapping[str, ExternalClockPrior]) -> csr_array[Any]:

@@ -22,7 +22,7 @@ def test_the_absorbed_residuals_are_the_trace_of_the_dense_hat_matrix() -> None:
     problem, state, prior = simulated_problem(3)
     found = covariance(problem, state, prior)
     known = {label: found.free.submatrix(found.a_inv_b.parts[label][1]) for label in problem.by_label}
-    paths = StackedTrajectories.of(state.trajectories)
+    paths = StackedTrajectories.of(state.by_label)
     mine = sum(
         _hat_matrix_trace(problem, state, paths, found, known[rows.label], [rows], 2000) for rows in problem.rows
     )

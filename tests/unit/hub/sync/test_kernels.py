@@ -14,7 +14,7 @@ import pytest
 
 from edge.uav.correlation.features import cell_features
 from hatch_build import FLAGS
-from hub.bundle.bordered_system import PathBlocks
+from hub.bundle.bordered_system import PathBlocks, add_rows
 from hub.bundle.problem import OFFSET, READOUT, CameraState
 from hub.bundle.residuals import SplineSupport, evaluate_points, jacobians
 from hub.sync.lag_scan import smallest_eigenvalues
@@ -125,11 +125,14 @@ def test_neighbours_are_judged_alike(both: Both) -> None:
 def test_rows_of_the_adjustment_add_up_alike(both: Both, others: int) -> None:
     rng = np.random.default_rng(6)
     index, weights, terms = rng.integers(0, 20, 90), rng.random((90, 4)), rng.normal(size=(2, 3 + others, 90))
+    ends = np.array([40, 40, 90])
 
     def sums() -> Floats:
-        blocks = PathBlocks(24)
-        crossed, gram = blocks.add_rows(index, weights, terms)
-        return np.concatenate([blocks.band().ravel(), crossed.ravel(), gram.ravel()])
+        blocks = [PathBlocks(24) for _ in range(3)]
+        to = [(7 * k, one) for k, one in enumerate(blocks)]
+        crossed, gram = add_rows(to, ends, index + np.repeat([0, 7, 14], np.diff(ends, prepend=0)), weights, terms)
+        every = [*(one.band() for one in blocks), *(one for _, one in crossed), gram]
+        return np.concatenate([one.ravel() for one in every])
 
     np.testing.assert_allclose(*both(sums), rtol=1e-10, atol=1e-10)
 
