@@ -119,7 +119,7 @@ def read_follow_input(
         raise InputError(what, file=session, remedy="take the calibration of these cameras")
     if not any(message.detections for message in found):
         raise Refused(f"{session}: no {kind} in any frame" + "".join(f"; {warning}" for warning in left_out.warnings))
-    check_units(found, known, kind)
+    warnings += check_units(found, known, kind, session)
     times_ns, also = _wanted_times(found, known, shared, fps)
     return FollowInput(session.stem, found, times_ns, warnings + also, videos, log)
 
