@@ -22,7 +22,7 @@ from hub.tracking.detections import TrackingCamera
 from hub.trajectory.image_tracks import MAX_PAUSE_S
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
-from protocols.core.ranges import MAX_TIME_NS
+from protocols.core.ranges import MAX_CLOCK_RATE, MAX_TIME_NS, MIN_CLOCK_RATE
 from protocols.log.read.reader import LogReader
 from protocols.log.read.session import is_log
 from protocols.messages import syncline_pb2 as pb
@@ -176,7 +176,10 @@ def _wanted_times(
     by_camera: dict[str, set[int]] = {}
     for name, camera in known.calibration.cameras.items():
         clock = camera.time_map
-        if abs(clock.time_offset) * NANOSECONDS > MAX_TIME_NS or not 0.5 < clock.clock_rate < 2.0:
+        if (
+            abs(clock.time_offset) * NANOSECONDS > MAX_TIME_NS
+            or not MIN_CLOCK_RATE <= clock.clock_rate <= MAX_CLOCK_RATE
+        ):
             what = f"[{name}] time_offset or clock_rate is beyond any clock"
             raise InputError(what, file=known.file, remedy="give seconds, and a rate near 1")
         tracked = TrackingCamera.from_calibration(camera)
