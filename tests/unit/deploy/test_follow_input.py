@@ -246,3 +246,11 @@ def test_people_who_meet_nowhere_are_a_warning(tmp_path: Path) -> None:
     (warning,) = read(tmp_path, "\n".join([header, *squeezed])).warnings
     assert re.match(r"of \d+ people whom one camera sees where others look, others see \d+ there", warning)
     assert read(tmp_path, boxes_csv(8.0)).warnings == ()
+
+
+def test_a_camera_whose_time_offset_is_years_off_is_left_out_by_name(tmp_path: Path) -> None:
+    """Where two such cameras and two others were followed, their matrices became singular: a traceback."""
+    source = read(tmp_path, boxes_csv(3.0, 5.0, {"left": 0.0, "right": 0.0, "back": 1.7e9}))
+    assert {message.camera for message in source.observations} == {"left", "right"}
+    (warning,) = source.warnings
+    assert warning.startswith("back: left out, its frames are 1700000000 s from the others' by the calibration's time")
