@@ -86,8 +86,8 @@ FRAME_RATE_RATIOS = tuple(
 )
 """Ratios of common frame rates: timestamps made from frame numbers with a wrong frame rate are off by these."""
 SLOW_MOTION_RATES, _SHOWN_RATES = (60.0, 100.0, 120.0, 200.0, 240.0), (24.0, 25.0, 30.0)
+"""Frames a second of slow motion as phones and action cameras film it, and as their files show it."""
 _SLOW_MOTION = sorted({round(a / b, 9) for a in SLOW_MOTION_RATES for b in _SHOWN_RATES if a / b >= 2.5})
-"""How many times slower a slow-motion file shows what was filmed at these rates [1/s]."""
 _SAME_BANDWIDTH = 2.0
 """Ratio of the bandwidths of two views of one motion: at most 1.7 of waved markers and drones."""
 
