@@ -252,10 +252,12 @@ class _Writer:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._container is not None:
-            self._container.close()
-        if self._part is not None:
-            self._part.unlink(missing_ok=True)
+        try:
+            if self._container is not None:
+                self._container.close()
+        finally:  # on a full disk it cannot be closed either
+            if self._part is not None:
+                self._part.unlink(missing_ok=True)
 
     def write(self, image: Callable[[], Image], times: int) -> None:
         """Write an image ``times`` times (0 or less: not at all) on the grid."""

@@ -20,7 +20,7 @@ import numpy as np
 import tomli_w
 
 from deploy.offline.recognition import DETECTORS, Target, find_target
-from deploy.offline.single_target import rows_of_one_target
+from deploy.offline.single_target import rows_of_head_and_foot, rows_of_one_target
 from edge.detectors import base as detector_base
 from edge.detectors.base import Detector, Kind
 from edge.detectors.board.description import BOARD_FILE, Board
@@ -145,6 +145,9 @@ def session_from_videos(
     if len(found) < 2:
         listed = "; ".join(warnings)
         raise InputError(f"fewer than two videos can be used ({listed})", file=folder, remedy="add or replace videos")
+    # Their errors last for a step: they are for poses through measured lenses, not for lenses.
+    measured = (_measured_lens(given, camera) for camera in found)
+    of_ends = target.kind == "person" and all(lens is not None for lens in measured)
     lines: list[str] = list(target.notes)
     rows: list[str] = []
     for video in videos:
@@ -154,7 +157,7 @@ def session_from_videos(
         several = False
         if target.board is None:
             one, several = _one_target(video, one, what, warnings)
-        rows += one.rows
+        rows += rows_of_head_and_foot(one.rows) if of_ends else one.rows
         again = " (kept from before)" if kept else ""
         if refusal is None:
             lines.append(f"{video.path.name}: {what} in {one.frames_with_detection} of {one.frames} frames{again}")

@@ -36,6 +36,7 @@ from hub.calibration.pairs.pair_network import (
     frame_rate_warnings,
     solve_pairs,
 )
+from hub.calibration.people.stature import check_stature
 from hub.calibration.resection.moved_cameras import Move, moved_cameras, without_moved
 from hub.calibration.resection.set_clocks import between_settings, set_clocks
 from hub.calibration.resection.unconnected import connect_by_resection, listed
@@ -148,7 +149,9 @@ def calibrate(
         maps = [time_map_between(*clocks)] if of_two and len(clocks) == 2 == len(solution.prepared.cameras) else []
         if not (moves := moves_of_two(solution.prepared, maps, observations, online)):
             report("covariances", 0.95)
-            return assemble_calibration(rig, solution, refine_lenses=refine_lenses, online=online)
+            calibration = assemble_calibration(rig, solution, refine_lenses=refine_lenses, online=online)
+            check_stature(calibration.trajectories)
+            return calibration
     except Refused as refusal:
         if may_move and (found := _between_settings(prepared.cameras, observations, again)):
             return found

@@ -85,6 +85,21 @@ FRAME_RATE_RATIOS = tuple(
     )
 )
 """Ratios of common frame rates: timestamps made from frame numbers with a wrong frame rate are off by these."""
+SLOW_MOTION_RATES, _SHOWN_RATES = (60.0, 100.0, 120.0, 200.0, 240.0), (24.0, 25.0, 30.0)
+"""Frames a second of slow motion as phones and action cameras film it, and as their files show it."""
+_SLOW_MOTION = sorted({round(a / b, 9) for a in SLOW_MOTION_RATES for b in _SHOWN_RATES if a / b >= 2.5})
+_SAME_BANDWIDTH = 2.0
+"""Ratio of the bandwidths of two views of one motion: at most 1.7 of waved markers and drones."""
+
+
+def slow_motion_ratios(bandwidth: float, other: float) -> list[float]:
+    """Factors of the times of a slow-motion file, or of one beside slow-motion files, that explain two bandwidths.
+
+    bandwidth, other: of the motion [Hz] in it and in the other file.
+    """
+    ratio = bandwidth / max(other, 1e-9)
+    every = (factor for one in _SLOW_MOTION for factor in (1.0 / one, one))
+    return [factor for factor in every if 1.0 / _SAME_BANDWIDTH < ratio / factor < _SAME_BANDWIDTH]
 
 
 def solve_pair(
@@ -146,8 +161,8 @@ def solve_pair(
 class _PairSearch:
     """Tracks of one pair and what is common to the searches at all clock rates.
 
-    tried: number of rates searched so far. bandwidth: of the slower camera's motion [Hz]. span: of the shorter
-    recording [s]. step: of the lag scan [s].
+    tried: number of rates searched so far. bandwidths: of either camera's motion [Hz]. span: of the shorter recording
+    [s]. step: of the lag scan [s].
     """
 
     def __init__(
@@ -163,7 +178,7 @@ class _PairSearch:
         self.cache = cache = cache or TrackCache()
         self.step = scan_step(max(cache.fast_image_speed(track) for track in (*a, *b)), s)
         self.tried = 0
-        self.bandwidth = min(max(cache.bandwidth(track) for track in one) for one in (a, b))
+        self.bandwidths = [max(cache.bandwidth(track) for track in one) for one in (a, b)]
         self.span = min(max(t.basis.end for t in one) - min(t.basis.begin for t in one) for one in (a, b))
 
     def candidate_rates(self) -> Iterator[float]:
@@ -176,6 +191,7 @@ class _PairSearch:
                 yield 1.0 + k * slip
                 yield 1.0 - k * slip
         yield from FRAME_RATE_RATIOS
+        yield from slow_motion_ratios(self.bandwidths[1], self.bandwidths[0])
 
     def reuse_refusal(self, previous_refusal: PairSolution | None) -> PairSolution | None:
         """The known refusal of the search at rate 1, counted as if it were repeated; None if there is none."""
@@ -204,7 +220,8 @@ class _PairSearch:
                 return PairSolution(*names, _HARDLY_MOVES_AT_PREDICTED_LAG)
         known_fundamental = None if self.known_pose is None else self.known_pose.essential.T
         scan = scan_lags(moments, s.min_scan_support, known_fundamental, lag_window)
-        null_distributions = _NullDistributions(moments, scan, known_fundamental, self.bandwidth)
+        bandwidth = min(self.bandwidths[0], self.bandwidths[1] / rate)
+        null_distributions = _NullDistributions(moments, scan, known_fundamental, bandwidth)
         fits: list[PairFit] = []
         frame_rate_ratio = rate in FRAME_RATE_RATIOS and self.span < _MAX_RATE_BLIND_SPAN
         reliable: tuple[float, float] | None = None  # evidence and scan cost of the best reliable fit so far

@@ -18,6 +18,9 @@ from protocols.session.rig import Rig, misspelt_keys, read_rig
 RIG_FILE = "rig.toml"
 OBSERVATIONS_FILE = "observations.csv"
 _MANY_TIMES = 10  # distinct ones that are all whole by chance: of stamps in tenths of a second one set in 10^10
+_MANY_ROWS, _SMALL_PICTURE = 100, 0.55
+"""Rows of a camera, and the share of its width and of its height that they reach in every camera: those of pictures of
+half the size reach a half."""
 _MAX_OUTSIDE_SHARE = 0.01  # share of rows outside the image above which a warning is given
 
 
@@ -39,9 +42,9 @@ def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Ob
 
 
 def column_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
-    """Warnings for cameras with many rows outside their image (a wrong size, or u and v swapped), or with times that
-    are frame numbers or milliseconds."""
-    warnings = []
+    """Warnings for cameras with many rows outside their image (a wrong size, or u and v swapped) or with times that are
+    frame numbers or milliseconds, and for pixels of smaller images."""
+    warnings, reach = [], list[float]()
     for name, camera in rig.cameras.items():
         pixels = np.concatenate([np.zeros((0, 2)), *(track.pixels for track in observations.of_camera(name))])
         outside = int(((pixels < -1.0) | (pixels > np.array(camera.size))).any(axis=1).sum())
@@ -50,12 +53,19 @@ def column_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
             warnings.append(
                 f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image; check size, u, v"
             )
+        if len(pixels) >= _MANY_ROWS:
+            reach.append(float((np.quantile(pixels, 0.99, axis=0) / camera.size).max()))
         times = np.concatenate([np.zeros(0), *(track.time for track in observations.of_camera(name))])
         if camera.fps > 1.0 and len(np.unique(times)) >= _MANY_TIMES and (times == np.rint(times)).all():
             warnings.append(
                 f"{name}: all its times are whole numbers of seconds, though it films {camera.fps:g} frames a second; "
                 "frame numbers have to be divided by the frame rate, milliseconds by 1000"
             )
+    if len(reach) > 1 and max(reach) < _SMALL_PICTURE:
+        warnings.append(
+            f"every camera's rows lie in the upper left of its picture, within {max(reach):.2g} of its width and "
+            "height: were they detected in smaller pictures than rig.toml states, or given as fractions?"
+        )
     return tuple(warnings)
 
 

@@ -4,8 +4,9 @@
         [--noise 2] [--no-lenses]
 
 Keypoints have noise and gaps, and a camera numbers people anew every 5 s. Printed: the share of the keypoints whose
-name is one person in all cameras, the errors of the calibration from them after one similarity, those of lags and clock
-rates over their stds, and readouts and clock steps, of which there are none.
+name is one person in all cameras, the errors of the calibration from them after one similarity (of two cameras: those
+of the relative pose), those of lags and clock rates over their stds, and readouts and clock steps, of which there are
+none.
 """
 
 from __future__ import annotations
@@ -96,15 +97,19 @@ def scored(world: PeopleWorld, rig: Rig, seen: Observations) -> tuple[str, Calib
     began = time.process_time()
     calibration = calibrate(rig, seen, thorough=True)
     spent, found = time.process_time() - began, calibration.cameras
-    places, true = (np.array([one[name].pose.position for name in found]) for one in (found, world.cameras))
-    fit = fit_similarity(places, true)
-    turns = [
-        np.degrees(so3.angle_between(fit.pose(one.pose).rotation, world.cameras[name].pose.rotation))
-        for name, one in found.items()
-    ]
-    worst = 100 * float(np.linalg.norm(fit.points(places) - true, axis=1).max())
+    poses = [{name: one[name].pose for name in found} for one in (found, world.cameras)]
+    centres = [np.array([pose.position for pose in one.values()]) for one in poses]
+    if len(found) > 2:
+        fit = fit_similarity(*centres)
+        turns = [so3.angle_between(fit.pose(poses[0][name]).rotation, pose.rotation) for name, pose in poses[1].items()]
+        worst = f"{100 * float(np.linalg.norm(fit.points(centres[0]) - centres[1], axis=1).max()):.1f} cm"
+    else:  # two centres fit always, and leave the turn about their line
+        base, other = ([one[name].rotation for one in poses] for name in found)
+        turns = [so3.angle_between(*(b @ a.T for a, b in zip(base, other, strict=True)))]
+        lines = [a @ (one[1] - one[0]) / np.linalg.norm(one[1] - one[0]) for a, one in zip(base, centres, strict=True)]
+        worst = f"direction {np.degrees(np.arccos(min(lines[0] @ lines[1], 1.0))):.2f}°"
     lags = 1e3 * float(np.abs(clock_errors(world, calibration)[:, 0]).max())
-    text = f"{len(found)} of {len(world.cameras)} cameras, {worst:.1f} cm, {max(turns):.2f}°, lags {lags:.1f} ms"
+    text = f"{len(found)} of {len(world.cameras)} cameras, {worst}, {np.degrees(max(turns)):.2f}°, lags {lags:.1f} ms"
     return f"{text}, {spent:.0f} s of CPU", calibration
 
 

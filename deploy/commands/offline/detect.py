@@ -168,7 +168,9 @@ def detect(
         )
     if not found.rows:
         remedy = (
-            "a lower `score` in its file may find more" if detector else _REMEDIES[mode if mode in _REMEDIES else what]
+            "a lower `score` in its file may find more, if its `classes`, `box` and `pixels` are those of the model"
+            if detector
+            else _REMEDIES[mode if mode in _REMEDIES else what]
         )
         raise Refused("; ".join((f"{video}: no {what} in any of {found.frames} frames", *found.warnings, remedy)))
     write_together({**files, out: found.to_csv()})

@@ -32,6 +32,9 @@ BOXES_FILE = "boxes.csv"
 _BOX_COLUMNS = ("camera", "frame", "time", "x", "y", "width", "height")
 _MAX_TIME_S = 9e9
 """Beyond it a time [s] does not fit into 64 bits of nanoseconds."""
+_MIN_CORNERS, _MIN_OVERLAP = 20, 0.25
+"""Boxes, all larger than their distance from the picture's corner, and the share of them that leaves the picture: with
+a width that is the right edge it is that of the people beyond the middle."""
 _MAX_EMPTY_PER_FRAME = 20
 """Frames without a row that are added for one with rows. Rarer numbers are labels, not a numbering of the frames."""
 
@@ -94,6 +97,18 @@ def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> Detectio
     for side, wrong in ((3, "its foot is not below its head"), (2, "its right side is not right of its left")):
         table.refuse(box[:, side] <= 0.0, partial(_flat, box, wrong))
     limit = np.array([sizes[name] for name in table.columns["camera"]], dtype=np.float64)
+    table.refuse(
+        np.full(len(box), bool((box <= 1.0).all())),
+        lambda row: "all boxes are within 0 to 1: fractions of the picture",
+        "multiply x and width by the picture's width, y and height by its height",
+    )
+    overlap = ((box[:, :2] + box[:, 2:]) > limit).any(axis=1)
+    corners = len(box) >= _MIN_CORNERS and (box[:, 2:] > box[:, :2]).all() and overlap.mean() > _MIN_OVERLAP
+    table.refuse(
+        np.full(len(box), bool(corners)),
+        lambda row: "width and height look like the right and the lower edge of the boxes",
+        "subtract x and y from them",
+    )
     # Annotations of people at the border, drawn from the ground up, may just miss the picture.
     outside = ((box[:, :2] >= limit + box[:, 2:]) | (box[:, :2] + 2.0 * box[:, 2:] <= 0.0)).any(axis=1)
     table.refuse(

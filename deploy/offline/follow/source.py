@@ -22,7 +22,7 @@ from hub.tracking.detections import TrackingCamera
 from hub.trajectory.image_tracks import MAX_PAUSE_S
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
-from protocols.core.ranges import MAX_TIME_NS
+from protocols.core.ranges import MAX_CLOCK_RATE, MAX_TIME_NS, MIN_CLOCK_RATE
 from protocols.log.read.reader import LogReader
 from protocols.log.read.session import is_log
 from protocols.messages import syncline_pb2 as pb
@@ -119,9 +119,11 @@ def read_follow_input(
         raise InputError(what, file=session, remedy="take the calibration of these cameras")
     if not any(message.detections for message in found):
         raise Refused(f"{session}: no {kind} in any frame" + "".join(f"; {warning}" for warning in left_out.warnings))
-    check_units(found, known, kind)
-    times_ns, also = _wanted_times(found, known, shared, fps)
-    return FollowInput(session.stem, found, times_ns, warnings + also, videos, log)
+    warnings += check_units(found, known, kind, session)
+    by_camera, apart = _at_one_time(_reference_times(found, known))
+    found = [message for message in found if message.camera in by_camera]
+    times_ns, also = _wanted_times(by_camera, known, shared, fps)
+    return FollowInput(session.stem, found, times_ns, warnings + apart + also, videos, log)
 
 
 def _rows_file(session: Path) -> Path | None:
@@ -169,20 +171,56 @@ def _without_clock_steps(messages: list[pb.Observation]) -> tuple[list[pb.Observ
     return left_in, tuple(warnings)
 
 
-def _wanted_times(
-    messages: list[pb.Observation], known: GivenCalibration, shared: bool, fps: float | None
-) -> tuple[list[int], tuple[str, ...]]:
-    """Reference times [ns] of rows: --fps, all times of a shared clock, or the reference camera's frames; warnings."""
+def _reference_times(messages: list[pb.Observation], known: GivenCalibration) -> dict[str, set[int]]:
+    """The reference times [ns] of each camera's frames. Raises InputError for a clock that is none."""
     by_camera: dict[str, set[int]] = {}
     for name, camera in known.calibration.cameras.items():
         clock = camera.time_map
-        if abs(clock.time_offset) * NANOSECONDS > MAX_TIME_NS or not 0.5 < clock.clock_rate < 2.0:
+        if (
+            abs(clock.time_offset) * NANOSECONDS > MAX_TIME_NS
+            or not MIN_CLOCK_RATE <= clock.clock_rate <= MAX_CLOCK_RATE
+        ):
             what = f"[{name}] time_offset or clock_rate is beyond any clock"
             raise InputError(what, file=known.file, remedy="give seconds, and a rate near 1")
         tracked = TrackingCamera.from_calibration(camera)
         times = {tracked.reference_ns(message.device_time_ns) for message in messages if message.camera == name}
         if times:
             by_camera[name] = times
+    return by_camera
+
+
+def _at_one_time(by_camera: dict[str, set[int]]) -> tuple[dict[str, set[int]], tuple[str, ...]]:
+    """The cameras less those a longer pause than a recording's away from most frames; warnings.
+
+    Nobody is followed for so long.
+    """
+    begun = sorted(by_camera, key=lambda name: min(by_camera[name]))
+    groups: list[list[str]] = []
+    for name in begun:
+        if groups and min(by_camera[name]) - max(max(by_camera[one]) for one in groups[-1]) < MAX_PAUSE_S * NANOSECONDS:
+            groups[-1].append(name)
+        else:
+            groups.append([name])
+    kept = max(groups, key=lambda group: sum(len(by_camera[name]) for name in group))
+    first = min(min(by_camera[name]) for name in kept)
+    left = (
+        f"{name}: left out, its frames are {abs(min(by_camera[name]) - first) / NANOSECONDS:.0f} s from the others' by "
+        "the calibration's time offsets"
+        for name in by_camera
+        if name not in kept
+    )
+    if len(kept) < 2 <= len(by_camera):
+        raise Refused(f"no two cameras have a time in common: {next(left)}; is the calibration of this recording?")
+    return {name: times for name, times in by_camera.items() if name in kept}, tuple(left)
+
+
+def _wanted_times(
+    by_camera: Mapping[str, set[int]], known: GivenCalibration, shared: bool, fps: float | None
+) -> tuple[list[int], tuple[str, ...]]:
+    """Reference times [ns] of rows: --fps, all times of a shared clock, or the reference camera's frames; warnings.
+
+    by_camera: reference times [ns] of the frames.
+    """
     every = set().union(*by_camera.values())
     alone = _without_common_time({name: (min(times), max(times)) for name, times in by_camera.items()})
     if len(alone) == len(by_camera) > 1:

@@ -274,8 +274,8 @@ def _within_frame_inflation(parts: list[tuple[Floats, Floats]]) -> float:
     label_count = np.bincount(frame, minlength=len(stamps))
     others = label_count - 1.0
     pairs = float((label_count * others).sum()) / 2.0
-    variance = float(np.mean(residual**2))
-    if pairs < _MIN_PAIRS or variance <= 0.0:
+    variance = float(np.mean(residual**2)) if pairs >= _MIN_PAIRS else 0.0
+    if variance <= 0.0:
         return 1.0
     sums = np.stack([np.bincount(frame, column, len(stamps)) for column in residual.T])
     correlation = (float((sums**2).sum()) - float((residual**2).sum())) / (4.0 * pairs * variance)

@@ -1,8 +1,9 @@
 """Synchronisation of all camera pairs of a session, and correction of wrong frame rates.
 
-Times made from frame numbers with a wrong frame rate run 0.4 to 2.5 times as fast as they should. Searching for that in
-every pair is slow, so only cameras that are not connected to the others are tried at such rates. The rate found becomes
-the camera's time scale: its times are multiplied by it, so that later steps see clock rates near 1.
+Times made from frame numbers with a wrong frame rate run 0.4 to 2.5 times as fast as they should, those of slow motion
+up to 10 times. Searching for that in every pair is slow, so only cameras that are not connected to the others are tried
+at such rates. The rate found becomes the camera's time scale: its times are multiplied by it, so that later steps see
+clock rates near 1.
 
 Where the images are consistent with several lags (periodic motion), external clock priors may select one of them. They
 are used last, so that they change no lag that the images determine.
@@ -26,7 +27,7 @@ from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior
 from hub.sync.common_clock import solve_common_clock_pair
 from hub.sync.hypothesis import PairFit, PairSolution, evidence
 from hub.sync.pair_ranking import ranking_score
-from hub.sync.pair_solver import FRAME_RATES, solve_pair
+from hub.sync.pair_solver import FRAME_RATES, SLOW_MOTION_RATES, solve_pair
 from hub.sync.settings import PairSettings
 from hub.sync.track_cache import TrackCache
 from hub.trajectory.image_tracks import smooth_only
@@ -389,15 +390,20 @@ def frame_rate_warnings(prepared: PreparedSession, pairs: list[PairSolution]) ->
         ratio = prepared.time_scale(typical) / prepared.time_scale(name)
         nominal, actual = _likely_frame_rates(ratio, _observed_frame_rate(prepared, name))
         if 2 * len(consistent) > len(connected):
-            comparison = f"the others': were they made with {nominal} fps for {actual}?"
+            comparison = f"the others': were they made with {nominal} fps for {actual}{_slow_motion(ratio)}?"
         else:
             nominal_typical, actual_typical = _likely_frame_rates(1.0 / ratio, _observed_frame_rate(prepared, typical))
             comparison = (
-                f"{typical}'s: were they made with {nominal} fps for {actual}, "
-                f"or {typical}'s with {nominal_typical} for {actual_typical}?"
+                f"{typical}'s: were they made with {nominal} fps for {actual}{_slow_motion(ratio)}, "
+                f"or {typical}'s with {nominal_typical} for {actual_typical}{_slow_motion(1.0 / ratio)}?"
             )
         out.append(f"{name}: its times run {ratio:.4g} times as fast as {comparison}")
     return tuple(out)
+
+
+def _slow_motion(ratio: float) -> str:
+    """A hint at slow motion where times run ``ratio`` times as fast as they should."""
+    return " (slow motion)" if ratio > 1.9 else ""  # 50 fps shown at 25, or more
 
 
 def _same_time_scale(prepared: PreparedSession, a: str, b: str) -> bool:
@@ -415,7 +421,8 @@ def _likely_frame_rates(ratio: float, observed: float) -> tuple[str, str]:
 
     observed: frame rate by the camera's own time stamps.
     """
-    standard = [(a, b) for a in FRAME_RATES for b in FRAME_RATES if abs(b / a / ratio - 1.0) < _RATIO_TOLERANCE]
+    rates = (*FRAME_RATES, *SLOW_MOTION_RATES)
+    standard = [(a, b) for a in rates for b in rates if abs(b / a / ratio - 1.0) < _RATIO_TOLERANCE]
     likely = min(standard, key=lambda pair: abs(pair[0] - observed), default=(observed, observed * ratio))
     return f"{likely[0]:.3g}", f"{likely[1]:.3g}"
 

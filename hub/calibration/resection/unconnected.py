@@ -9,13 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from hub.bundle.initialisation import Reconstruction, place_cameras
+import numpy as np
+
+from hub.bundle.initialisation import CameraInput, Reconstruction, place_cameras
 from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import FreeParameters
 from hub.calibration.resection.scan import find_time_map
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from hub.sync.hypothesis import PairSolution
-from hub.sync.pair_solver import FRAME_RATE_RATIOS
+from hub.sync.null_distribution import bandwidth
+from hub.sync.pair_solver import FRAME_RATE_RATIOS, slow_motion_ratios
+from hub.trajectory.image_tracks import SmoothTrack
 
 RATES = (1.0, *FRAME_RATE_RATIOS)
 
@@ -36,7 +40,9 @@ def connect_by_resection(
     pairs: list[PairSolution] = []
     reasons: dict[str, str] = {}
     for name in names:
-        found, step = find_time_map(prepared.cameras[name], reconstruction, RATES)
+        motion = float(np.median([_bandwidth(prepared.camera(one)) for one in reconstruction.names]))
+        rates = (*RATES, *slow_motion_ratios(_bandwidth(prepared.cameras[name]), motion))
+        found, step = find_time_map(prepared.cameras[name], reconstruction, rates)
         reasons[name] = step
         if found is None:
             continue
@@ -75,3 +81,8 @@ def listed(names: Iterable[str], most: int = 16) -> str:
     """The first of very many, as a message has room for."""
     every = list(names)
     return ", ".join(every[:most]) + (f" and {len(every) - most} more" if len(every) > most else "")
+
+
+def _bandwidth(camera: CameraInput) -> float:
+    """Of the fastest motion in a camera's tracks [Hz]."""
+    return max((bandwidth(one) for one in camera.tracks.values() if isinstance(one, SmoothTrack)), default=0.0)

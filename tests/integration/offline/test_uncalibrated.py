@@ -189,6 +189,12 @@ WRONG_RATES = [
     (11, {"cam0": 2.4}, "cam0: its times run 2.4 times as fast as the others'"),
     (12, {"cam2": 0.5}, "cam2: its times run 0.5 times as fast as the others'"),
     (13, {"cam0": 1 / 2.4}, "cam0: its times run 0.41"),
+    (
+        16,
+        {"cam1": 4.0},
+        "cam1: its times run 4 times as fast as the others': were they made with 25 fps for 100 (slow mo",
+    ),
+    (17, {"cam0": 8.0}, "cam0: its times run 8 times as fast as the others'"),
 ]
 
 

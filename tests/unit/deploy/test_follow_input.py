@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -205,3 +208,49 @@ def test_ends_of_the_made_up_people_are_in_every_picture() -> None:
         for time in np.linspace(0.0, 8.0, 9):
             for end in ends(name, float(time)):
                 assert ((end > 0.0) & (end < SIZE)).all()
+
+
+@pytest.mark.parametrize(
+    ("boxes", "what"),
+    [
+        (
+            lambda x, y, w, h: (x / 2, y / 2, w / 2, h / 2),
+            "its pixels are about 2 times too small for the cal",
+        ),
+        (lambda x, y, w, h: (x / 1.5, y / 1.5, w / 1.5, h / 1.5), r"about 1\.5 times too small .* \(left: 960x720\)"),
+        (lambda x, y, w, h: (x, y, w, h / 2), r"its people are about 2 times too small for 1\.7 m from head to foot"),
+        (lambda x, y, w, h: (x + w / 4, y + h / 4, w / 2, h / 2), "its people are about 2 times too small"),
+        (lambda x, y, w, h: (x, y, x + w, y + h), "boxes.csv:2: width and height look like the right and the lower"),
+        (lambda x, y, w, h: (x / 960, y / 720, w / 960, h / 720), "all boxes are within 0 to 1: fractions of the pict"),
+    ],
+)
+@pytest.mark.parametrize("up", [True, False])
+def test_boxes_of_other_pictures_or_of_half_bodies_are_named(
+    boxes: Callable[..., tuple[float, ...]], what: str, up: bool, tmp_path: Path
+) -> None:
+    """They became dozens of tracks of nobody without a word."""
+    header, *lines = boxes_csv(3.0).splitlines()
+    cells = [line.split(",") for line in lines]
+    text = "\n".join([header, *(",".join([*c[:3], *map(str, boxes(*map(float, c[3:])))]) for c in cells)])
+    (tmp_path / "boxes.csv").write_text(text + "\n", encoding="utf-8")
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    with pytest.raises(InputError, match=what):
+        read_follow_input(tmp_path, known if up else replace(known, up=None), "person", tmp_path)
+
+
+def test_people_who_meet_nowhere_are_a_warning(tmp_path: Path) -> None:
+    """As from pictures that a detector squeezed into squares."""
+    header, *lines = boxes_csv(8.0).splitlines()
+    cells = [line.split(",") for line in lines]
+    squeezed = [",".join([*c[:3], str(0.4 * float(c[3])), c[4], str(0.4 * float(c[5])), c[6]]) for c in cells]
+    (warning,) = read(tmp_path, "\n".join([header, *squeezed])).warnings
+    assert re.match(r"of \d+ people whom one camera sees where others look, others see \d+ there", warning)
+    assert read(tmp_path, boxes_csv(8.0)).warnings == ()
+
+
+def test_a_camera_whose_time_offset_is_years_off_is_left_out_by_name(tmp_path: Path) -> None:
+    """Where two such cameras and two others were followed, their matrices became singular: a traceback."""
+    source = read(tmp_path, boxes_csv(3.0, 5.0, {"left": 0.0, "right": 0.0, "back": 1.7e9}))
+    assert {message.camera for message in source.observations} == {"left", "right"}
+    (warning,) = source.warnings
+    assert warning.startswith("back: left out, its frames are 1700000000 s from the others' by the calibration's time")

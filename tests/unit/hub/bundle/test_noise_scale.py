@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,13 @@ import pytest
 
 from hub.bundle.adjustment import adjust
 from hub.bundle.covariance import covariance
-from hub.bundle.noise.noise_scale import _hat_matrix_trace, _serial_inflation, rescale_noise, residual_std
+from hub.bundle.noise.noise_scale import (
+    _hat_matrix_trace,
+    _serial_inflation,
+    _within_frame_inflation,
+    rescale_noise,
+    residual_std,
+)
 from hub.bundle.normal_equations import build_system
 from hub.bundle.residuals import StackedTrajectories
 from hub.calibration.pipeline import calibrate
@@ -78,3 +85,9 @@ def test_lost_frames_and_the_order_of_rows_change_nothing() -> None:
     assert _serial_inflation([(time[keep], off[keep])]) == pytest.approx(whole, rel=0.15)
     mixed = rng.permutation(6000)
     assert _serial_inflation([(time[mixed], off[mixed])]) == whole
+
+
+def test_labels_without_a_row_that_is_predicted_are_no_warning() -> None:
+    """Of a camera that lost all its labels numpy warned on the user's terminal."""
+    with warnings.catch_warnings(action="error"):
+        assert _within_frame_inflation([(np.zeros(0), np.zeros((0, 2)))] * 2) == 1.0
