@@ -32,6 +32,7 @@ from edge.uav.target.state_estimate import estimate_target
 from edge.uav.target.target import Target
 from edge.uav.target.tracklets import Tracklet, Tracklets
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.order_statistics import quantile
 from protocols.geometry.types import Floats, Image, Ints
 
 _SAMPLE_SIZE = pf.KldSampleSize(cell=(0.6, 0.6), error=0.05, confidence=0.99, min_count=150, max_count=500)
@@ -174,12 +175,12 @@ class GroundTracker:
             return MeasurementLikelihood.empty()
         near_particles = np.flatnonzero(near)
         weights = particles.weights[near_particles] / share
-        main, main_weight = near_particles, 1.0
+        main, others, main_weight = near_particles, near_particles[:0], 1.0
         if self._missed_frames:
             cluster = pf.densest_cluster(particles.position[near_particles], weights, 2.0 * target.length)
-            main, main_weight = near_particles[cluster.members], cluster.weight
+            main, others = near_particles[cluster.members], near_particles[~cluster.members]
+            main_weight = cluster.weight
         candidates = self._search(image, main, wide=True)
-        others = np.setdiff1d(near_particles, main)
         if len(others) and main_weight < 0.97:
             # Particles outside the main cluster are searched in groups, another group each frame.
             centre = self._rng.choice(others)
@@ -254,7 +255,7 @@ class GroundTracker:
         positions = self._particles.position[members]
         centre = weights @ positions
         distance = np.hypot(*(positions - centre).T)
-        reach = float(np.quantile(distance, 0.97)) if wide else 1.5 * self._target.length
+        reach = quantile(distance, 0.97) if wide else 1.5 * self._target.length
         angle = pf.circular_mean(self._particles.heading[members], weights) if self._target.aligned else None
         if wide:
             self._target.update_resolution(centre)
@@ -326,7 +327,7 @@ class GroundTracker:
         positions = particles.position[inside]
         points = np.concatenate([positions, positions - half_length, positions + half_length])
         last_pixel = np.array([working.shape[1] - 1, working.shape[0] - 1])
-        ground = np.nan_to_num(self._localiser.pixels(points), nan=-1.0)
+        ground = np.fmax(self._localiser.pixels(points), -1.0)  # not a number behind the camera
         at = np.clip((ground / self._localiser.downscale).astype(int), 0, last_pixel)
         colours = self._localiser.photometric.corrected(working[at[:, 1], at[:, 0]][None])[0]
         open_road = (self._road.log_likelihood_ratios(colours) > -0.3).reshape(3, -1)

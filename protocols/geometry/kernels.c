@@ -924,3 +924,242 @@ void orientation_cells(integer height, integer width, integer cell, const float 
             for (integer o = 0; o < ORIENTATIONS; o++) out[(o * rows + row) * columns + column] = sums[o] * share;
         }
 }
+
+/* edge.uav.ground.ego_motion._solve_pose: Geman-McClure Gauss-Newton of a camera over the plane, from ground points and
+   their normalised coordinates (n, 2). state: rotation (3, 3) and centre (3,) with k = 6, homography (3, 3) with k = 8;
+   in place. information, prior: (k,). unit: a pixel in normalised coordinates. scratch: (2 n,). */
+void fit_plane_camera(integer n, const double *ground, const double *normalised, integer k, double *state,
+                      const double *information, const double *prior, double unit, double noise, integer iterations,
+                      double *scratch)
+{
+    enum { MOST = 8 };
+    double total[MOST] = {0.0}, width = 0.0, *squared = scratch, *distance = scratch + n;
+    for (integer step = 0; step < iterations; step++) {
+        double h[9], m[MOST * MOST] = {0.0}, delta[MOST] = {0.0}, grown[9], next[9];
+        memcpy(h, state, sizeof h);
+        if (k == 6)
+            for (int r = 0; r < 3; r++)
+                h[3 * r + 2] = -(state[3 * r] * state[9] + state[3 * r + 1] * state[10] + state[3 * r + 2] * state[11]);
+        for (integer i = 0; i < n; i++) {
+            double gx = ground[2 * i], gy = ground[2 * i + 1], z = h[6] * gx + h[7] * gy + h[8];
+            double depth = z > 1e-9 ? z : 1.0, u = normalised[2 * i] - (h[0] * gx + h[1] * gy + h[2]) / depth;
+            double v = normalised[2 * i + 1] - (h[3] * gx + h[4] * gy + h[5]) / depth;
+            squared[i] = u * u + v * v;
+            distance[i] = sqrt(squared[i]);
+        }
+        double middle = median(n, distance);
+        width = step ? at_least(at_least(width * 0.4, 2.5 * middle), 0.3 * unit) : at_least(middle * 1.5, 2.0 * unit);
+        for (integer i = 0; i < n; i++) {
+            double gx = ground[2 * i], gy = ground[2 * i + 1], z = h[6] * gx + h[7] * gy + h[8];
+            if (!(z > 1e-9)) continue;
+            double x = (h[0] * gx + h[1] * gy + h[2]) / z, y = (h[3] * gx + h[4] * gy + h[5]) / z;
+            double u = normalised[2 * i] - x, v = normalised[2 * i + 1] - y, narrow = 1.0 + squared[i] / (width * width);
+            double weight = 1.0 / (narrow * narrow) / (noise * noise);
+            double across[MOST] = {-x * y, 1.0 + x * x, -y}, down[MOST] = {-1.0 - y * y, x * y, x};
+            if (k == 6)
+                for (int c = 0; c < 3; c++) {
+                    across[3 + c] = (x * state[6 + c] - state[c]) / z;
+                    down[3 + c] = (y * state[6 + c] - state[3 + c]) / z;
+                }
+            else {
+                const double of_x[MOST] = {1.0, 0.0, -y, x, x, y, -x * x, -x * y};
+                const double of_y[MOST] = {0.0, 1.0, x, y, -y, x, -x * y, -y * y};
+                memcpy(across, of_x, sizeof across);
+                memcpy(down, of_y, sizeof down);
+            }
+            for (integer a = 0; a < k; a++) {
+                double wx = weight * across[a], wy = weight * down[a];
+                for (integer b = a; b < k; b++) m[a * k + b] += wx * across[b] + wy * down[b];
+                delta[a] += wx * u + wy * v;
+            }
+        }
+        for (integer a = 0; a < k; a++) {
+            for (integer b = 0; b < a; b++) m[a * k + b] = m[b * k + a];
+            m[a * k + a] += information[a];
+            delta[a] += information[a] * (prior[a] - total[a]);
+        }
+        solve(k, m, delta); /* definite: the prior alone is */
+        for (integer a = 0; a < k; a++) total[a] += delta[a];
+        if (k == 6) {
+            rotation_of(delta, grown);
+            for (int c = 0; c < 3; c++) state[9 + c] += delta[3 + c];
+        } else {
+            const double of[9] = {1.0 + delta[3] + delta[4], delta[5] - delta[2], delta[0],
+                                  delta[2] + delta[5], 1.0 + delta[3] - delta[4], delta[1], delta[6], delta[7], 1.0};
+            memcpy(grown, of, sizeof grown);
+        }
+        for (int r = 0; r < 3; r++)
+            for (int c = 0; c < 3; c++)
+                next[3 * r + c] = grown[3 * r] * state[c] + grown[3 * r + 1] * state[3 + c] + grown[3 * r + 2] * state[6 + c];
+        double root = k == 6 ? 1.0
+                             : cbrt(next[0] * (next[4] * next[8] - next[5] * next[7])
+                                    - next[1] * (next[3] * next[8] - next[5] * next[6])
+                                    + next[2] * (next[3] * next[7] - next[4] * next[6]));
+        for (int c = 0; c < 9; c++) state[c] = next[c] / root;
+        if (step >= 2 && at_least(fabs(delta[0]), fabs(delta[1])) < 0.01 * unit) break;
+    }
+}
+
+/* edge.uav.ground.image_plane.ImagePlane.project: pixels (n, 2) of ground points (n, 2) by a homography, normalised from
+   ground, and a pinhole with Brown's distortion, which beyond ``radius`` stays what it is there; NaN behind. */
+void ground_pixels(integer n, const double *points, const double *homography, const double *matrix,
+                   const double *coefficients, double fold, double radius, double *pixels)
+{
+    const double *h = homography, *m = matrix;
+    for (integer i = 0; i < n; i++) {
+        double gx = points[2 * i], gy = points[2 * i + 1], z = h[6] * gx + h[7] * gy + h[8];
+        if (!(z > 1e-9)) z = NAN;
+        double x = (h[0] * gx + h[1] * gy + h[2]) / z, y = (h[3] * gx + h[4] * gy + h[5]) / z;
+        double px = m[0] * x + m[1] * y + m[2], py = m[3] * x + m[4] * y + m[5];
+        if (coefficients) {
+            double from = sqrt(x * x + y * y), share = from > radius ? radius / from : 1.0;
+            double flat[2] = {share * x, share * y}, bent[2], unused[4];
+            brown_distortion(1, flat, coefficients, bent, unused);
+            /* Beyond the fold, where there is no distortion to continue, and inside it alike: the pinhole. */
+            if (flat[0] * flat[0] + flat[1] * flat[1] < fold * fold) {
+                px += m[0] * (bent[0] - flat[0]) + m[1] * (bent[1] - flat[1]);
+                py += m[3] * (bent[0] - flat[0]) + m[4] * (bent[1] - flat[1]);
+            }
+        }
+        pixels[2 * i] = px;
+        pixels[2 * i + 1] = py;
+    }
+}
+
+/* Bin of a colour of three bytes, with ``bits`` of each. */
+static INLINE integer colour_bin(const uint8_t *colour, integer bits)
+{
+    const integer shift = 8 - bits;
+    return ((integer)(colour[0] >> shift) << (2 * bits)) + ((integer)(colour[1] >> shift) << bits) + (colour[2] >> shift);
+}
+
+/* edge.uav.ground.colour_table.values: table (bins^3,) at colours (n, 3). */
+void colour_values(integer n, const uint8_t *colours, integer bits, const float *table, float *out)
+{
+    for (integer i = 0; i < n; i++) out[i] = table[colour_bin(colours + 3 * i, bits)];
+}
+
+/* edge.uav.ground.colour_table.histogram (bins^3,) of colours (n, 3) with weights (n,), unless null; smoothed along each
+   axis: ``centre`` of itself and ``side`` of either neighbour. */
+void colour_histogram(integer n, const uint8_t *colours, const double *weights, integer bits, double centre,
+                      double side, double *out)
+{
+    const integer bins = (integer)1 << bits, size = bins * bins * bins;
+    memset(out, 0, sizeof(double) * (size_t)size);
+    for (integer i = 0; i < n; i++) out[colour_bin(colours + 3 * i, bits)] += weights ? weights[i] : 1.0;
+    for (integer step = bins * bins; step; step /= bins) /* planes, then rows, then single values */
+        for (integer base = 0; base < size; base += bins * step) {
+            double before[1024], *at = out + base;
+            for (integer c = 0; c < step; c++) before[c] = 0.0;
+            for (integer k = 0; k < bins; k++, at += step)
+                for (integer c = 0; c < step; c++) {
+                    double value = at[c], after = k + 1 < bins ? at[step + c] : 0.0;
+                    at[c] = centre * value + side * (before[c] + after);
+                    before[c] = value;
+                }
+        }
+}
+
+/* Means (h / factor, w / factor, 3) of an image (h, w, 3), rounded as cv2.resize with INTER_AREA does. sums: (3 w,). */
+WIDE void reduce_image(integer height, integer width, integer factor, const uint8_t *image, uint16_t *sums,
+                       uint8_t *out)
+{
+    const integer rows = height / factor, columns = width / factor, line = 3 * width;
+    const float share = 1.0f / (float)(factor * factor), round_even = 12582912.0f; /* leaves no bits for a fraction */
+    for (integer row = 0; row < rows; row++) {
+        const uint8_t *from = image + row * factor * line;
+        for (integer c = 0; c < line; c++) sums[c] = from[c];
+        for (integer k = 1; k < factor; k++)
+            for (integer c = 0; c < line; c++) sums[c] = (uint16_t)(sums[c] + from[k * line + c]);
+        for (integer column = 0; column < columns; column++)
+            for (integer c = 0; c < 3; c++) {
+                const uint16_t *at = sums + 3 * factor * column + c;
+                integer total = 0;
+                for (integer k = 0; k < factor; k++) total += at[3 * k];
+                float rounded = (float)total * share + round_even;
+                *out++ = (uint8_t)(rounded - round_even);
+            }
+    }
+}
+
+/* Index of n in an image that is continued by its border value, and by its mirror image (OpenCV's default). */
+static INLINE integer clamped(integer k, integer n) { return k < 0 ? 0 : k < n ? k : n - 1; }
+static INLINE integer mirrored(integer k, integer n) { return clamped(k < 0 ? -k : k < n ? k : 2 * n - 2 - k, n); }
+
+/* edge.uav.ground.photometric: colours (n, c) at points (n, 2) of an image (h, w, c) blurred over 5 x 5 px, as cv2.blur
+   and cv2.remap give them. */
+void blurred_colours(integer n, const float *points, integer height, integer width, integer channels,
+                     const uint8_t *image, double *out)
+{
+    for (integer i = 0; i < n; i++) {
+        const float left = floorf(points[2 * i]), top = floorf(points[2 * i + 1]);
+        const float fx = points[2 * i] - left, fy = points[2 * i + 1] - top;
+        const integer x = (integer)left, y = (integer)top;
+        integer rows[2][5], columns[2][5];
+        for (integer u = 0; u < 2; u++)
+            for (integer k = 0; k < 5; k++) {
+                rows[u][k] = mirrored(clamped(y + u, height) + k - 2, height) * width * channels;
+                columns[u][k] = mirrored(clamped(x + u, width) + k - 2, width) * channels;
+            }
+        for (integer c = 0; c < channels; c++) {
+            float blurred[2][2];
+            for (integer v = 0; v < 2; v++)
+                for (integer u = 0; u < 2; u++) {
+                    int total = 0;
+                    for (integer k = 0; k < 5; k++)
+                        for (integer j = 0; j < 5; j++) total += image[rows[v][k] + columns[u][j] + c];
+                    blurred[v][u] = (float)((2 * total + 25) / 50);
+                }
+            out[i * channels + c] = blurred[0][0] * ((1.0f - fy) * (1.0f - fx)) + blurred[0][1] * ((1.0f - fy) * fx)
+                                    + blurred[1][0] * (fy * (1.0f - fx)) + blurred[1][1] * (fy * fx);
+        }
+    }
+}
+
+/* edge.uav.target.motion_history.MotionHistory.fit: position, velocity and acceleration (3, 2) of positions (n, 2) at
+   times (n,) before now, in three steps with Cauchy weights. information: (3,), right: (3, 2) of the prior. Left are the
+   last normal matrix (3, 3), errors (n,) and weights (n,). */
+void fit_motion(integer n, const double *time, const double *positions, const double *stds, const double *information,
+                const double *right, double *weight, double *solution, double *normal, double *error)
+{
+    for (int step = 0; step < 3; step++) {
+        double m[9], values[2][3];
+        for (int a = 0; a < 3; a++)
+            for (int c = 0; c < 2; c++) values[c][a] = right[2 * a + c];
+        memset(normal, 0, sizeof m);
+        for (int a = 0; a < 3; a++) normal[4 * a] = information[a];
+        for (integer i = 0; i < n; i++) {
+            const double row[3] = {1.0, time[i], 0.5 * time[i] * time[i]};
+            for (int a = 0; a < 3; a++) {
+                for (int b = 0; b < 3; b++) normal[3 * a + b] += row[a] * weight[i] * row[b];
+                for (int c = 0; c < 2; c++) values[c][a] += row[a] * weight[i] * positions[2 * i + c];
+            }
+        }
+        for (int c = 0; c < 2; c++) {
+            memcpy(m, normal, sizeof m);
+            solve(3, m, values[c]); /* definite: the prior alone is */
+            for (int a = 0; a < 3; a++) solution[2 * a + c] = values[c][a];
+        }
+        for (integer i = 0; i < n; i++) {
+            double half = 0.5 * time[i] * time[i], dx = solution[0] + time[i] * solution[2] + half * solution[4];
+            double dy = solution[1] + time[i] * solution[3] + half * solution[5];
+            dx -= positions[2 * i];
+            dy -= positions[2 * i + 1];
+            error[i] = sqrt(dx * dx + dy * dy);
+            double ratio = error[i] / (3.0 * stds[i]);
+            weight[i] = 1.0 / (stds[i] * stds[i]) / (1.0 + ratio * ratio);
+        }
+    }
+}
+
+/* edge.uav.ground.road_map.RoadMap: values (n,) of a grid (rows, columns) whose first cell begins at (x, y), at points
+   (n, 2); 0 outside. */
+void grid_values(integer n, const double *points, double x, double y, double cell, integer rows, integer columns,
+                 const float *grid, double *out)
+{
+    for (integer i = 0; i < n; i++) {
+        double column = floor((points[2 * i] - x) / cell), row = floor((points[2 * i + 1] - y) / cell);
+        int good = column >= 0.0 && row >= 0.0 && column < (double)columns && row < (double)rows;
+        out[i] = good ? grid[(integer)row * columns + (integer)column] : 0.0;
+    }
+}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -52,6 +53,7 @@ class Target:
         self.local_gain = TargetGain()
         self._typical_score = 1.0
         self._learnt_share = 0.0  # visible share when it was learnt
+        self._searched: GroundPatch | None = None  # the last one
         self._learn(image, 1.0)
 
     @property
@@ -95,14 +97,14 @@ class Target:
         axes = footprint.pixel_jacobian(self._localiser.plane, self._localiser.target_matrix, position)
         if not np.isfinite(axes).all():
             return
-        scale = float(np.sqrt(abs(np.linalg.det(axes))))
+        scale = math.sqrt(abs(axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]))
         if scale > 1e-6:
             self.scale = scale
             self.appearance.set_cell_size(1.0 / scale)
 
     def search(self, image: Image, centre: Floats, half: float, angle: float | None = None) -> list[Candidate]:
         """Candidates about a ground point."""
-        patch = self.patch(image, centre, half, angle)
+        patch = self._searched = self.patch(image, centre, half, angle)
         return [] if patch is None else self.appearance.candidates(patch)
 
     def align(self, image: Image, fit: MotionFit) -> None:
@@ -124,7 +126,9 @@ class Target:
         """Update the photometric gain at the target if it is complete and its shape matches."""
         if best.visible_share < _FULL_SHARE or not self.appearance.shape_matches(best):
             return
-        patch = self.patch(image, best.ground, 0.7)
+        patch = self._searched
+        if patch is None or patch.angle != best.angle:  # it was found in another one
+            patch = self.patch(image, best.ground, 0.7)
         if patch is not None:
             self.local_gain.update(self.appearance.log_brightness(patch, best.ground))
 
