@@ -1152,14 +1152,125 @@ void fit_motion(integer n, const double *time, const double *positions, const do
     }
 }
 
-/* edge.uav.ground.road_map.RoadMap: values (n,) of a grid (rows, columns) whose first cell begins at (x, y), at points
-   (n, 2); 0 outside. */
-void grid_values(integer n, const double *points, double x, double y, double cell, integer rows, integer columns,
-                 const float *grid, double *out)
+/* A grid of values (rows, columns) whose first cell begins at (x, y). */
+typedef struct {
+    double x, y, cell;
+    integer rows, columns;
+    const float *values;
+} grid_t;
+
+/* Its value at a point; 0 outside. */
+static INLINE double grid_value(const grid_t *grid, double px, double py)
 {
-    for (integer i = 0; i < n; i++) {
-        double column = floor((points[2 * i] - x) / cell), row = floor((points[2 * i + 1] - y) / cell);
-        int good = column >= 0.0 && row >= 0.0 && column < (double)columns && row < (double)rows;
-        out[i] = good ? grid[(integer)row * columns + (integer)column] : 0.0;
+    double column = floor((px - grid->x) / grid->cell), row = floor((py - grid->y) / grid->cell);
+    if (!(column >= 0.0 && row >= 0.0 && column < (double)grid->columns && row < (double)grid->rows)) return 0.0;
+    return grid->values[(integer)row * grid->columns + (integer)column];
+}
+
+/* edge.uav.ground.road_map.RoadMap: values (n,) at points (n, 2). */
+void grid_values(double x, double y, double cell, integer rows, integer columns, const float *values, integer n,
+                 const double *points, double *out)
+{
+    const grid_t grid = {x, y, cell, rows, columns, values};
+    for (integer i = 0; i < n; i++) out[i] = grid_value(&grid, points[2 * i], points[2 * i + 1]);
+}
+
+/* edge.uav.prediction.paths.road_edges: distances (2, n), right and left, of ``count`` with ``step`` between them. */
+void road_edges(double x, double y, double cell, integer rows, integer columns, const float *values, integer n,
+                const double *points, const double *headings, integer count, double step, double off, double unknown,
+                integer most_unknown, double *out)
+{
+    const grid_t grid = {x, y, cell, rows, columns, values};
+    for (integer side = 0; side < 2; side++)
+        for (integer i = 0; i < n; i++) {
+            double across = sin(headings[i]), along = cos(headings[i]), *to = out + side * n + i;
+            integer blank = 0;
+            *to = NAN;
+            for (integer k = 0; k < count; k++) {
+                double reach = side ? -step * (double)k : step * (double)k;
+                double odds = grid_value(&grid, points[2 * i] - reach * across, points[2 * i + 1] + reach * along);
+                blank += fabs(odds) < unknown;
+                if (!(odds < off)) continue;
+                if (k && blank <= most_unknown) *to = fabs(reach);
+                break;
+            }
+        }
+}
+
+/* edge.uav.prediction.paths._look_ahead: of points (arcs, steps, offsets) in the axes of a car at (px, py), mean weighted
+   values (arcs,) within limits, shares that are known (arcs,), and whether any is in the first steps. */
+void arc_values(double x, double y, double cell, integer rows, integer columns, const float *values, integer arcs,
+                integer steps, integer offsets, const double *forward, const double *lateral, const double *weights,
+                double px, double py, double heading, double known, const double *limits, integer first, double *out)
+{
+    const grid_t grid = {x, y, cell, rows, columns, values};
+    const double c = cos(heading), s = sin(heading), many = (double)(steps * offsets);
+    double *seen = out + arcs, *near = out + 2 * arcs;
+    *near = 0.0;
+    for (integer arc = 0; arc < arcs; arc++) {
+        double total = 0.0, count = 0.0;
+        for (integer step = 0; step < steps; step++)
+            for (integer k = 0; k < offsets; k++) {
+                double ahead = *forward++, aside = *lateral++;
+                double odds = grid_value(&grid, px + c * ahead - s * aside, py + s * ahead + c * aside);
+                int observed = fabs(odds) > known;
+                if (observed && step < first) *near = 1.0;
+                count += observed;
+                total += weights[step] * (observed ? at_least(odds < limits[1] ? odds : limits[1], limits[0]) : limits[2]);
+            }
+        out[arc] = total / many;
+        seen[arc] = count / many;
     }
+}
+
+/* edge.uav.prediction.particle_filter.densest_cluster of points (n, 2): members (n,), centre (2,) and weight in out.
+   scratch: (2, n). */
+WIDE void densest_cluster(integer n, const double *points, const double *weights, double radius, double *scratch,
+                          uint8_t *members, double *out)
+{
+    double *column = scratch, *row = scratch + n, best = -1.0, x = 0.0, y = 0.0, total = 0.0;
+    integer fullest = 0;
+    for (integer i = 0; i < n; i++) {
+        column[i] = floor(points[2 * i] / radius);
+        row[i] = floor(points[2 * i + 1] / radius);
+    }
+    for (integer i = 0; i < n; i++) {
+        double around = 0.0;
+        for (integer j = 0; j < n; j++) {
+            double dx = fabs(column[j] - column[i]), dy = fabs(row[j] - row[i]);
+            around += (dx <= 1.0) & (dy <= 1.0) ? weights[j] * (dx + dy > 0.0 ? 1.0 : 1.0 + 1e-9) : 0.0;
+        }
+        if (around > best) best = around, fullest = i;
+    }
+    for (integer i = 0; i < n; i++) {
+        members[i] = column[i] == column[fullest] && row[i] == row[fullest];
+        if (!members[i]) continue;
+        double weight = weights[i] + 1e-300;
+        x += weight * points[2 * i];
+        y += weight * points[2 * i + 1];
+        total += weight;
+    }
+    x /= total;
+    y /= total;
+    for (int step = 0; step < 10; step++) {
+        double sum = 0.0, sum_x = 0.0, sum_y = 0.0;
+        integer changed = 0;
+        for (integer i = 0; i < n; i++) {
+            double dx = points[2 * i] - x, dy = points[2 * i + 1] - y;
+            uint8_t within = dx * dx + dy * dy <= radius * radius;
+            scratch[i] = within;
+            changed += within != members[i];
+            sum += within ? weights[i] : 0.0;
+            sum_x += within ? weights[i] * points[2 * i] : 0.0;
+            sum_y += within ? weights[i] * points[2 * i + 1] : 0.0;
+        }
+        if (!(sum > 0.0) || !changed) break;
+        for (integer i = 0; i < n; i++) members[i] = scratch[i] != 0.0;
+        x = sum_x / sum;
+        y = sum_y / sum;
+    }
+    out[0] = x;
+    out[1] = y;
+    out[2] = 0.0;
+    for (integer i = 0; i < n; i++) out[2] += members[i] ? weights[i] : 0.0;
 }

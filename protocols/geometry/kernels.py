@@ -40,7 +40,10 @@ _SIGNATURES = {
     "reduce_image": "nnnppp",
     "blurred_colours": "npnnnpp",
     "fit_motion": "nppppppppp",
-    "grid_values": "npdddnnpp",
+    "grid_values": "dddnnpnpp",
+    "road_edges": "dddnnpnppndddnp",
+    "arc_values": "dddnnpnnnpppddddpnp",
+    "densest_cluster": "nppdppp",
 }
 """Of each function: counts n, doubles d and pointers p."""
 

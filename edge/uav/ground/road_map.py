@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -133,7 +135,7 @@ class RoadMap:
 
     def log_odds(self, points: Floats) -> Floats:
         """Log-odds (n,) at ground points (n, 2); 0 where unknown."""
-        return _lookup(self._log_odds, points, self._origin)
+        return _lookup(self._log_odds, self._origin, points)
 
     def smooth_around(self, centre: Floats, reach: float) -> None:
         """Smooth the map around a position, for ``smooth_log_odds``."""
@@ -145,11 +147,14 @@ class RoadMap:
         self._smooth = np.asarray(cv2.blur(closed, (3, 3)), np.float32)
         self._smooth_origin = self._origin + first * CELL
 
+    @property
+    def smooth_grid(self) -> tuple[Singles, Floats]:
+        """The smoothed part (h, w), or else the map, and where its first cell begins (2,)."""
+        return (self._log_odds, self._origin) if self._smooth is None else (self._smooth, self._smooth_origin)
+
     def smooth_log_odds(self, points: Floats) -> Floats:
         """Smoothed log-odds (n,) at ground points (n, 2) of the smoothed part; 0 outside it."""
-        if self._smooth is None:
-            return self.log_odds(points)
-        return _lookup(self._smooth, points, self._smooth_origin)
+        return _lookup(*self.smooth_grid, points)
 
     def road_cells(self, centre: Floats, reach: float) -> Floats:
         """Ground points (n, 2) of cells with high log-odds of road, subsampled, for overlays."""
@@ -183,12 +188,17 @@ def _interpolate_mesh(mesh: Singles, size: tuple[int, int]) -> Singles:
     return np.asarray(cv2.remap(mesh, grid[0], grid[1], cv2.INTER_LINEAR), np.float32)
 
 
-def _lookup(field: Singles, points: Floats, origin: Floats) -> Floats:
+def kernel_arguments(field: Singles, origin: Floats) -> tuple[Any, ...]:
+    """What the kernels take of a map (h, w) whose first cell begins at ``origin`` (2,)."""
+    return (*origin.tolist(), CELL, *field.shape, field)
+
+
+def _lookup(field: Singles, origin: Floats, points: Floats) -> Floats:
     """Values (n,) at ground points (n, 2) of a map (h, w) whose first cell begins at ``origin`` (2,); 0 outside."""
     height, width = field.shape
     if kernels.AVAILABLE:
         out, points = np.empty(len(points)), np.ascontiguousarray(points)
-        kernels.call("grid_values", len(out), points, *origin.tolist(), CELL, height, width, field, out)
+        kernels.call("grid_values", *kernel_arguments(field, origin), len(out), points, out)
         return out
     index = np.floor((points - origin) / CELL)
     with np.errstate(invalid="ignore"):
