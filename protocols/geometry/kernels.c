@@ -1000,30 +1000,36 @@ void fit_plane_camera(integer n, const double *ground, const double *normalised,
     }
 }
 
-/* edge.uav.ground.image_plane.ImagePlane.project: pixels (n, 2) of ground points (n, 2) by a homography, normalised from
-   ground, and a pinhole with Brown's distortion, which beyond ``radius`` stays what it is there; NaN behind. */
-void ground_pixels(integer n, const double *points, const double *homography, const double *matrix,
-                   const double *coefficients, double fold, double radius, double *pixels)
+/* A pinhole with Brown's distortion over a plane. homography: (3, 3), normalised from ground. */
+typedef struct {
+    const double *homography, *matrix, *coefficients;
+    double fold, radius;
+} plane_camera_t;
+
+/* The pixel (2,) of a ground point; beyond ``radius`` the distortion stays what it is there; NaN behind. */
+static INLINE void ground_pixel(const plane_camera_t *camera, double gx, double gy, double *pixel)
 {
-    const double *h = homography, *m = matrix;
-    for (integer i = 0; i < n; i++) {
-        double gx = points[2 * i], gy = points[2 * i + 1], z = h[6] * gx + h[7] * gy + h[8];
-        if (!(z > 1e-9)) z = NAN;
-        double x = (h[0] * gx + h[1] * gy + h[2]) / z, y = (h[3] * gx + h[4] * gy + h[5]) / z;
-        double px = m[0] * x + m[1] * y + m[2], py = m[3] * x + m[4] * y + m[5];
-        if (coefficients) {
-            double from = sqrt(x * x + y * y), share = from > radius ? radius / from : 1.0;
-            double flat[2] = {share * x, share * y}, bent[2], unused[4];
-            brown_distortion(1, flat, coefficients, bent, unused);
-            /* Beyond the fold, where there is no distortion to continue, and inside it alike: the pinhole. */
-            if (flat[0] * flat[0] + flat[1] * flat[1] < fold * fold) {
-                px += m[0] * (bent[0] - flat[0]) + m[1] * (bent[1] - flat[1]);
-                py += m[3] * (bent[0] - flat[0]) + m[4] * (bent[1] - flat[1]);
-            }
-        }
-        pixels[2 * i] = px;
-        pixels[2 * i + 1] = py;
-    }
+    const double *h = camera->homography, *m = camera->matrix;
+    double z = h[6] * gx + h[7] * gy + h[8];
+    if (!(z > 1e-9)) z = NAN;
+    double x = (h[0] * gx + h[1] * gy + h[2]) / z, y = (h[3] * gx + h[4] * gy + h[5]) / z;
+    pixel[0] = m[0] * x + m[1] * y + m[2];
+    pixel[1] = m[3] * x + m[4] * y + m[5];
+    if (!camera->coefficients) return;
+    double from = sqrt(x * x + y * y), share = from > camera->radius ? camera->radius / from : 1.0;
+    double flat[2] = {share * x, share * y}, bent[2], unused[4];
+    if (!(flat[0] * flat[0] + flat[1] * flat[1] < camera->fold * camera->fold)) return; /* nothing to continue */
+    brown_distortion(1, flat, camera->coefficients, bent, unused);
+    pixel[0] += m[0] * (bent[0] - flat[0]) + m[1] * (bent[1] - flat[1]);
+    pixel[1] += m[3] * (bent[0] - flat[0]) + m[4] * (bent[1] - flat[1]);
+}
+
+/* edge.uav.ground.image_plane.ImagePlane.project: pixels (n, 2) of ground points (n, 2). */
+void ground_pixels(const double *homography, const double *matrix, const double *coefficients, double fold,
+                   double radius, integer n, const double *points, double *pixels)
+{
+    const plane_camera_t camera = {homography, matrix, coefficients, fold, radius};
+    for (integer i = 0; i < n; i++) ground_pixel(&camera, points[2 * i], points[2 * i + 1], pixels + 2 * i);
 }
 
 /* Bin of a colour of three bytes, with ``bits`` of each. */
@@ -1273,4 +1279,31 @@ WIDE void densest_cluster(integer n, const double *points, const double *weights
     out[1] = y;
     out[2] = 0.0;
     for (integer i = 0; i < n; i++) out[2] += members[i] ? weights[i] : 0.0;
+}
+
+/* edge.uav.ground_tracker.GroundTracker._open_road: of each car at positions (n, 2), how many of its middle and its ends,
+   ``reach`` away along its heading, have a colour with a value above ``least`` in the reduced image (h, w, 3). levels:
+   (256, 3) that take the place of the image's, or null. */
+void open_road(const double *homography, const double *matrix, const double *coefficients, double fold, double radius,
+               integer n, const double *positions, const double *headings, double reach, double factor, integer height,
+               integer width, const uint8_t *image, const uint8_t *levels, integer bits, const float *table,
+               double least, integer *counts)
+{
+    const plane_camera_t camera = {homography, matrix, coefficients, fold, radius};
+    for (integer i = 0; i < n; i++) {
+        double dx = reach * cos(headings[i]), dy = reach * sin(headings[i]), pixel[2];
+        counts[i] = 0;
+        for (int end = -1; end <= 1; end++) {
+            ground_pixel(&camera, positions[2 * i] + end * dx, positions[2 * i + 1] + end * dy, pixel);
+            double x = pixel[0] / factor, y = pixel[1] / factor;
+            integer column = x > 0.0 ? (integer)(x < (double)width ? x : (double)(width - 1)) : 0;
+            integer row = y > 0.0 ? (integer)(y < (double)height ? y : (double)(height - 1)) : 0;
+            uint8_t colour[3];
+            for (int c = 0; c < 3; c++) {
+                colour[c] = image[3 * (row * width + column) + c];
+                if (levels) colour[c] = levels[3 * colour[c] + c];
+            }
+            counts[i] += table[colour_bin(colour, bits)] > (float)least;
+        }
+    }
 }

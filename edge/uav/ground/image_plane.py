@@ -45,17 +45,25 @@ class ImagePlane:
         m = self._inverse
         return np.asarray(pixels @ m[:2, :2].T + m[:2, 2])
 
+    @property
+    def compiled(self) -> bool:
+        """Whether the kernels project as this lens does."""
+        return kernels.AVAILABLE and not (self.lens is not None and self.lens.fisheye)
+
+    def kernel_arguments(self, matrix: Floats) -> tuple[Floats, Floats, Floats | None, float, float]:
+        """What the kernels take of a camera with homography ``matrix`` (3, 3), normalised from ground."""
+        coefficients, fold = (None, np.inf) if self.lens is None else (self.lens.distortions, self.lens.fold)
+        return np.ascontiguousarray(matrix), self.matrix, coefficients, fold, self._valid_radius
+
     def project(self, matrix: Floats, ground: Floats) -> Floats:
         """Pixels (n, 2) of ground points (n, 2) by a homography (3, 3), normalised from ground; NaN behind the camera.
 
         Beyond the valid radius the distortion polynomial is not calibrated: there it stays what it is at that radius,
         which keeps the map continuous.
         """
-        if kernels.AVAILABLE and not (self.lens is not None and self.lens.fisheye):
-            coefficients, fold = (None, np.inf) if self.lens is None else (self.lens.distortions, self.lens.fold)
+        if self.compiled:
             out, ground = np.empty((len(ground), 2)), np.ascontiguousarray(ground, dtype=np.float64)
-            lens = self.matrix, coefficients, fold, self._valid_radius
-            kernels.call("ground_pixels", len(out), ground, np.ascontiguousarray(matrix), *lens, out)
+            kernels.call("ground_pixels", *self.kernel_arguments(matrix), len(out), ground, out)
             return out
         normalised = apply_homography(matrix, ground)
         pinhole = self._pinhole(normalised)

@@ -46,13 +46,18 @@ class PhotometricGain:
     def corrected(self, image: Image, log_gain: float = 0.0) -> Image:
         """The image (h, w, 3) with the gain removed. log_gain: additional gain to remove, natural logarithm."""
         if abs(log_gain) >= _NEGLIGIBLE_LOG_GAIN:
-            table = _lookup_table(self.gain * np.exp(log_gain))
-            return np.asarray(cv2.LUT(np.ascontiguousarray(image), table), np.uint8)
+            table: Image | None = _lookup_table(self.gain * np.exp(log_gain))
+        else:
+            table = self.table
+        return image if table is None else np.asarray(cv2.LUT(np.ascontiguousarray(image), table), np.uint8)
+
+    @property
+    def table(self) -> Image | None:
+        """Lookup table (1, 256, channels) that removes the gain; None where there is none."""
         if np.abs(self.gain - 1.0).max() < 0.02:
-            return image
-        if self._lookup_table is None:
-            self._lookup_table = _lookup_table(self.gain)
-        return np.asarray(cv2.LUT(np.ascontiguousarray(image), self._lookup_table), np.uint8)
+            return None
+        self._lookup_table = _lookup_table(self.gain) if self._lookup_table is None else self._lookup_table
+        return self._lookup_table
 
 
 class TargetGain:

@@ -83,10 +83,11 @@ class RoadMap:
         """Whether a colour model has been learnt."""
         return self._log_ratio_table is not None
 
-    def log_likelihood_ratios(self, colours: Image) -> Singles:
-        """Log-likelihood ratio of road for colours (n, 3)."""
+    @property
+    def colour_table(self) -> tuple[int, Singles]:
+        """Bits of a channel, and the log-likelihood ratio (8**bits,) of road of each colour."""
         assert self._log_ratio_table is not None
-        return colour_table.values(self._log_ratio_table, colours, _BITS)
+        return _BITS, self._log_ratio_table
 
     def update(
         self, working: Image, downscale: int, plane: ImagePlane, matrix: Floats, excluded: Floats | None

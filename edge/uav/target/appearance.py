@@ -7,6 +7,7 @@ evaluated at every cell of the patch at once; maxima of their mean are the candi
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -85,10 +86,12 @@ def rectify_patch(
     angle: float,
     half: tuple[float, float],
     cell_size: float,
+    corrected: Callable[[Image], Image] = lambda cells: cells,
 ) -> GroundPatch | None:
     """Ground patch about ``centre`` (2,), of half sizes ``half`` along and across ``angle``; None if not in view.
 
     matrix: (3, 3) normalised image from ground. cell_size: ground units per cell; increased for a very large patch.
+    corrected: what is done to the cells' colours.
     """
     cell_size = max(cell_size, 2.0 * max(half) / _MAX_PATCH_CELLS)
     width, height = (2 * math.ceil(h / cell_size) + 1 for h in half)
@@ -127,9 +130,8 @@ def rectify_patch(
         full = np.ones(image.shape[:2], np.float32)
         visible = cv2.warpPerspective(full, image_from_cell, (width, height), flags=flags)
         valid = (visible > 0.75).astype(np.float32)
-    return GroundPatch(
-        np.asarray(cells, dtype=np.uint8), np.asarray(valid, np.float32), centre, angle, cell_size, complete
-    )
+    cells = corrected(np.asarray(cells, dtype=np.uint8))
+    return GroundPatch(cells, np.asarray(valid, np.float32), centre, angle, cell_size, complete)
 
 
 class AppearanceModel:
@@ -283,7 +285,8 @@ class AppearanceModel:
         else:
             visible = np.maximum(_correlate(valid, self._target_mask) / total, 0.0)
             seen_ring = np.maximum(_correlate(valid, self._ring_mask) / ring_total, 0.0)
-            self._shares = {patch.valid.shape: (visible, seen_ring)} if patch.complete else {}
+            if patch.complete:
+                self._shares[patch.valid.shape] = visible, seen_ring
         inner = _correlate(ratio, self._target_mask) / (total * np.maximum(visible, 0.2))
         outer = _correlate(ratio, self._ring_mask) / (ring_total * np.maximum(seen_ring, 0.2))
         colour = inner - 0.5 * outer

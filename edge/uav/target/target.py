@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -68,9 +68,8 @@ class Target:
         occluded, which shifts the position of the match.
         """
         unoccluded = max(0.05 * self.length, 0.6 / self.scale)
-        occluded = (
-            _OCCLUSION_STD * self.length * float(np.clip(self._typical_score - _OCCLUSION_MARGIN - score, 0.0, 0.5))
-        )
+        missing = min(max(self._typical_score - _OCCLUSION_MARGIN - score, 0.0), 0.5)
+        occluded = _OCCLUSION_STD * self.length * missing
         return unoccluded * (1.0 + 5.0 * max(0.0, 0.97 - visible_share)) + occluded
 
     def is_unoccluded(self, score: float) -> bool:
@@ -87,10 +86,8 @@ class Target:
         localiser, cell = self._localiser, self.appearance.cell_size
         sides = (min(half * self.length, _MAX_HALF_CELLS * cell),) * 2
         angle = self.angle if angle is None else angle
-        patch = rectify_patch(image, localiser.plane, localiser.target_matrix, centre, angle, sides, cell)
-        if patch is None:
-            return None
-        return replace(patch, cells=localiser.photometric.corrected(patch.cells, self.local_gain.log_gain))
+        gain = partial(localiser.photometric.corrected, log_gain=self.local_gain.log_gain)
+        return rectify_patch(image, localiser.plane, localiser.target_matrix, centre, angle, sides, cell, gain)
 
     def update_resolution(self, position: Floats) -> None:
         """Adapt scale and cell size to the resolution at the target's position."""
