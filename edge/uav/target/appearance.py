@@ -318,22 +318,27 @@ class AppearanceModel:
         return found
 
     def _shape_response(self, patch: GroundPatch, border: tuple[int, int, int, int]) -> Singles:
-        """Normalised cross-correlation with the template, maximum over the first and the adapted one."""
+        """Normalised cross-correlation with the adapted template, and the first one where that fits nowhere."""
+        best = np.zeros(patch.valid.shape, np.float32)
         if self._template is None or self._first_template is None:
-            return np.zeros(patch.valid.shape, np.float32)
-        grey = np.asarray(cv2.cvtColor(patch.cells, cv2.COLOR_BGR2GRAY), np.float32)
-        templates = (
-            [self._template] if self._first_template is self._template else [self._template, self._first_template]
+            return best
+        grey, fits = (
+            np.asarray(cv2.cvtColor(patch.cells, cv2.COLOR_BGR2GRAY), np.float32),
+            _MIN_SHAPE_RATIO * self._shape_scale,
         )
         if patch.complete:
             grey = np.asarray(cv2.copyMakeBorder(grey, *border, cv2.BORDER_REPLICATE), np.float32)
-            found = [_correlate(grey, one, cv2.TM_CCOEFF_NORMED) for one in templates]
         else:
-            grey = grey - float(grey.mean())
-            valid = _padded(patch.valid, border)
-            grey = _padded(grey * patch.valid, border)
-            found = _masked_correlations(grey, valid, templates)
-        best = np.asarray(found[0] if len(found) == 1 else np.maximum(found[0], found[1]), np.float32)
+            valid, grey = _padded(patch.valid, border), _padded((grey - float(grey.mean())) * patch.valid, border)
+            sums = _visible_sums(grey, valid, self._template.shape)
+        for number, template in enumerate((self._template, self._first_template)):
+            if number and (template is self._template or best.max() > fits):
+                break
+            if patch.complete:
+                found = _correlate(grey, template, cv2.TM_CCOEFF_NORMED)
+            else:
+                found = _masked_correlation(grey, valid, sums, template)
+            best = np.maximum(best, found) if number else found
         return np.where(np.isfinite(best), best, np.float32(0.0))
 
 
@@ -345,21 +350,22 @@ def _padded(field: Singles, border: tuple[int, int, int, int]) -> Singles:
     return np.asarray(cv2.copyMakeBorder(field, *border, cv2.BORDER_CONSTANT, value=0.0), np.float32)
 
 
-def _masked_correlations(field: Singles, valid: Singles, templates: list[Singles]) -> list[Singles]:
-    """Normalised correlations over the visible cells. field: 0 where ``valid`` is 0; same output size as CCORR."""
-    size = templates[0].shape[::-1]
-    inner = np.s_[size[1] // 2 : -(size[1] // 2), size[0] // 2 : -(size[0] // 2)]
-    parts = (valid, field, field * field)
-    n, image, image2 = (cv2.boxFilter(part, -1, size, normalize=False)[inner] for part in parts)
-    n, out = np.maximum(n, 1.0), []
-    for template in templates:
-        centred = template - float(template.mean())
-        mean, mean2 = _correlate(valid, centred), _correlate(valid, centred * centred)
-        cross = _correlate(field, centred) - image * mean / n
-        spread = np.maximum(image2 - image * image / n, 0.0) * np.maximum(mean2 - mean * mean / n, 0.0)
-        # Contrast below one grey level is noise.
-        out.append(np.asarray(cross / np.sqrt(np.maximum(spread, n * n)), np.float32))
-    return out
+def _visible_sums(field: Singles, valid: Singles, shape: tuple[int, ...]) -> list[Singles]:
+    """Number of visible cells below a template of this shape, sum and sum of squares of ``field``."""
+    inner = np.s_[shape[0] // 2 : -(shape[0] // 2), shape[1] // 2 : -(shape[1] // 2)]
+    parts = (cv2.boxFilter(one, -1, shape[::-1], normalize=False)[inner] for one in (valid, field, field * field))
+    return [np.asarray(one, np.float32) for one in parts]
+
+
+def _masked_correlation(field: Singles, valid: Singles, sums: list[Singles], template: Singles) -> Singles:
+    """Normalised correlation over the visible cells. field: 0 where ``valid`` is 0; same output size as CCORR."""
+    centred = template - float(template.mean())
+    n, image, image2 = np.maximum(sums[0], 1.0), *sums[1:]
+    mean, mean2 = _correlate(valid, centred), _correlate(valid, centred * centred)
+    cross = _correlate(field, centred) - image * mean / n
+    spread = np.maximum(image2 - image * image / n, 0.0) * np.maximum(mean2 - mean * mean / n, 0.0)
+    # Contrast below one grey level is noise.
+    return np.asarray(cross / np.sqrt(np.maximum(spread, n * n)), np.float32)
 
 
 def _subcell(score: Singles, row: int, column: int) -> tuple[float, float]:
