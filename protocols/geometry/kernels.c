@@ -1307,3 +1307,27 @@ void open_road(const double *homography, const double *matrix, const double *coe
         }
     }
 }
+
+/* edge.uav.ground.road_map.RoadMap.update: of a map (rows, columns), values of the colours of its cells in an image
+   (h, w, 3), by a table; 0 within two pixels of its border and beyond. pixels: (m, k, 2) of a mesh over the map, linear
+   between its points. scratch: (2 k + columns,). */
+void road_evidence(integer m, integer k, const double *pixels, integer rows, integer columns, integer height,
+                   integer width, const uint8_t *image, integer bits, const float *table, double *scratch, float *out)
+{
+    double *line = scratch, *place = scratch + 2 * k;
+    for (integer column = 0; column < columns; column++)
+        place[column] = (double)column * (double)(k - 1) / (double)(columns - 1);
+    for (integer row = 0; row < rows; row++) {
+        double down = (double)row * (double)(m - 1) / (double)(rows - 1);
+        integer low = clamped((integer)down, m - 1);
+        const double *from = pixels + 2 * k * low, part = down - (double)low;
+        for (integer c = 0; c < 2 * k; c++) line[c] = from[c] + part * (from[2 * k + c] - from[c]);
+        for (integer column = 0; column < columns; column++) {
+            integer left = clamped((integer)place[column], k - 1);
+            const double *at = line + 2 * left, share = place[column] - (double)left;
+            double x = at[0] + share * (at[2] - at[0]), y = at[1] + share * (at[3] - at[1]);
+            int inside = (x > 1.0) & (y > 1.0) & (x < (double)(width - 2)) & (y < (double)(height - 2));
+            *out++ = inside ? table[colour_bin(image + 3 * ((integer)(y + 0.5) * width + (integer)(x + 0.5)), bits)] : 0.0f;
+        }
+    }
+}

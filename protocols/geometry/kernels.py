@@ -41,6 +41,7 @@ _SIGNATURES = {
     "reduce_image": "nnnppp",
     "blurred_colours": "npnnnpp",
     "fit_motion": "nppppppppp",
+    "road_evidence": "nnpnnnnpnppp",
     "grid_values": "dddnnpnpp",
     "road_edges": "dddnnpnppndddnp",
     "arc_values": "dddnnpnnnpppddddpnp",

@@ -119,20 +119,28 @@ class RoadMap:
         mesh = np.column_stack([np.tile(gx, ny), np.repeat(gy, nx)])
         pixels = plane.project(matrix, (mesh + first + 0.5) * CELL + self._origin)
         pixels = np.fmin(np.fmax((pixels + 0.5) / downscale - 0.5, -1e4), 1e4).reshape(ny, nx, 2)
-        maps = _interpolate_mesh(pixels.astype(np.float32), (int(size[0]), int(size[1])))
-        across, down = cv2.split(maps)
-        warped = cv2.remap(working, across, down, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-        cells = np.asarray(warped, np.uint8)
-        height, width = working.shape[:2]
-        inside = (across > 1) & (down > 1) & (across < width - 2) & (down < height - 2)
-        evidence = np.clip(self._log_ratio_table, -1.0, 1.0) * np.float32(_MAX_UPDATE)
-        increment = colour_table.values(evidence, cells, _BITS) * inside
+        increment = self._evidence(working, pixels, (int(size[0]), int(size[1])))
         if excluded is not None and np.isfinite(excluded).all():
             outline = ((excluded - self._origin) / CELL - first - 0.5).clip(-1e4, 1e4).astype(np.int32)
             cv2.fillConvexPoly(increment, cv2.convexHull(outline[:, None]), 0.0)
         part = self._log_odds[first[1] : last[1], first[0] : last[0]]
         np.clip(part + increment, -_MAX_LOG_ODDS, _MAX_LOG_ODDS, out=part)
         self._smooth = None
+
+    def _evidence(self, working: Image, mesh: Floats, size: tuple[int, int]) -> Singles:
+        """What an image says of a map of this size. mesh: pixels (ny, nx, 2) of cells, linear between them."""
+        assert self._log_ratio_table is not None
+        table = np.clip(self._log_ratio_table, -1.0, 1.0) * np.float32(_MAX_UPDATE)
+        height, width = working.shape[:2]
+        if kernels.AVAILABLE:
+            out, line = np.empty(size[::-1], np.float32), np.empty(2 * mesh.shape[1] + size[0])
+            image = height, width, np.ascontiguousarray(working)
+            kernels.call("road_evidence", *mesh.shape[:2], mesh, *size[::-1], *image, _BITS, table, line, out)
+            return out
+        across, down = cv2.split(_interpolate_mesh(mesh.astype(np.float32), size))
+        cells = cv2.remap(working, across, down, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        inside = (across > 1) & (down > 1) & (across < width - 2) & (down < height - 2)
+        return np.asarray(colour_table.values(table, np.asarray(cells, np.uint8), _BITS) * inside)
 
     def log_odds(self, points: Floats) -> Floats:
         """Log-odds (n,) at ground points (n, 2); 0 where unknown."""

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from edge.uav.base import Box
 from edge.uav.correlation.features import cell_features
 from edge.uav.ground import colour_table
 from edge.uav.ground.ego_motion import EgoMotion, _solve_pose
@@ -21,6 +22,9 @@ from edge.uav.ground.image_plane import ImagePlane
 from edge.uav.ground.photometric import _blurred_colours
 from edge.uav.ground.plane_pose import PlaneHomography, PlanePose
 from edge.uav.ground.road_map import RoadMap
+from edge.uav.ground_tracker import GroundTracker
+from edge.uav.prediction import paths
+from edge.uav.prediction.particle_filter import densest_cluster
 from edge.uav.target.motion_history import MotionHistory
 from hatch_build import FLAGS
 from hub.bundle.bordered_system import PathBlocks
@@ -237,8 +241,55 @@ def test_colours_and_maps_are_looked_up_alike(both: Both) -> None:
     np.testing.assert_allclose(*both(lambda: colour_table.histogram(image, weights, 5, 0.25)), rtol=1e-12)
     road = RoadMap(np.zeros(2))
     road._log_odds[:] = rng.normal(size=road._log_odds.shape)
+    road._log_ratio_table = table
+    mesh = np.stack(np.meshgrid(np.linspace(-5.0, 64.0, 7), np.linspace(-9.0, 44.0, 5)), -1) + rng.random((5, 7, 2))
+    compiled, alone = both(lambda: road._evidence(image, mesh, (70, 55)))
+    assert np.mean(compiled != alone) < 0.2  # OpenCV interpolates in steps of 1/32: a sixth of a pixel here
+    np.testing.assert_array_equal(*both(lambda: road._evidence(image, mesh, (7, 5))))
+    assert 0.3 < np.mean(alone == 0.0) < 0.6
     points = np.concatenate([rng.uniform(-300.0, 300.0, (200, 2)), [[np.nan, 0.0], [np.inf, 3.0]]])
     np.testing.assert_array_equal(*both(lambda: road.log_odds(points)))
+
+
+def test_a_road_is_traced_alike(both: Both) -> None:
+    road, x = RoadMap(np.zeros(2)), np.arange(1024) * 0.5 - 256.0
+    across = np.abs(x[:, None] - 12.0 * np.sin(x / 40.0))  # of a road along the first axis
+    road._log_odds[:] = np.where(across < 4.0, 2.0, -1.5) * (x < 60.0) * (np.abs(x[:, None] - x) < 180.0)
+    road.smooth_around(np.zeros(2), 90.0)
+    points, headings = np.column_stack([x[300:700:7], np.zeros(58)]), np.linspace(-3.0, 3.0, 58)
+    compiled, alone = both(lambda: np.array(paths.road_edges(road, points, headings)))
+    assert 10 < np.isfinite(alone).sum() < 110
+    np.testing.assert_array_equal(compiled, alone)
+    traced = both(lambda: paths.trace_paths(road, np.zeros(2), 0.2, 0.0, 70.0, (4.0, 4.0))[0].points)
+    np.testing.assert_allclose(*traced, rtol=1e-9, atol=1e-9)
+
+
+def test_clusters_are_the_same(both: Both) -> None:
+    rng = np.random.default_rng(17)
+    for spread in (0.1, 3.0, 30.0):
+        points, weights = rng.normal(0.0, spread, (300, 2)), rng.random(300)
+        points[100:] += [40.0, -15.0]
+
+        def found(points: Floats = points, weights: Floats = weights) -> Floats:
+            cluster = densest_cluster(points, weights / weights.sum(), 4.0)
+            return np.array([*cluster.centre, cluster.weight, *cluster.members])
+
+        np.testing.assert_allclose(*both(found), rtol=1e-9)
+
+
+@pytest.mark.parametrize("gain", [1.0, 1.2])
+def test_open_road_is_counted_alike(both: Both, gain: float) -> None:
+    lens = Intrinsics(640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]))
+    tracker, rng = GroundTracker((640, 480), lens), np.random.default_rng(18)
+    tracker.begin(np.asarray(rng.integers(90, 110, (480, 640, 3)), np.uint8), 0.0, Box(300.0, 200.0, 40.0, 20.0))
+    tracker._localiser.photometric.gain = np.full(3, gain)
+    working = np.asarray(rng.integers(40, 160, (240, 320, 3)), np.uint8)
+    tracker._road.learn_colours(working[:60].reshape(-1, 3), working, 1.0)
+    tracker._road._log_ratio_table = rng.normal(size=16**3).astype(np.float32)
+    positions, headings = tracker._target.position + rng.normal(0.0, 20.0, (400, 2)), rng.normal(0.0, 2.0, 400)
+    compiled, alone = both(lambda: tracker._open_road(working, positions, headings))
+    assert set(alone) == {0, 1, 2, 3}
+    np.testing.assert_array_equal(compiled, alone)
 
 
 @pytest.mark.parametrize("size", [(1290, 35), (1723, 22)])
