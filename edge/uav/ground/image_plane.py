@@ -31,9 +31,7 @@ class ImagePlane:
         x, y = self.width - 1.0, self.height - 1.0
         self.corners: Floats = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]])
         """Pixels (4, 2), clockwise."""
-        self._valid_radius = (
-            np.inf
-        )  # normalised, up to which the distortion model is used: 1.3 times that of the corners
+        self._valid_radius = np.inf  # of the distortion model, normalised: 1.3 times that of the corners
         if self.distorted:
             radius = np.hypot(*self.normalise(self.corners).T)
             self._valid_radius = 1.3 * float(np.nanmax(radius)) if np.isfinite(radius).any() else 1.0

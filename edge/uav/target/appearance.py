@@ -322,17 +322,14 @@ class AppearanceModel:
         best = np.zeros(patch.valid.shape, np.float32)
         if self._template is None or self._first_template is None:
             return best
-        grey, fits = (
-            np.asarray(cv2.cvtColor(patch.cells, cv2.COLOR_BGR2GRAY), np.float32),
-            _MIN_SHAPE_RATIO * self._shape_scale,
-        )
+        grey = np.asarray(cv2.cvtColor(patch.cells, cv2.COLOR_BGR2GRAY), np.float32)
         if patch.complete:
             grey = np.asarray(cv2.copyMakeBorder(grey, *border, cv2.BORDER_REPLICATE), np.float32)
         else:
             valid, grey = _padded(patch.valid, border), _padded((grey - float(grey.mean())) * patch.valid, border)
             sums = _visible_sums(grey, valid, self._template.shape)
         for number, template in enumerate((self._template, self._first_template)):
-            if number and (template is self._template or best.max() > fits):
+            if number and (template is self._template or best.max() > _MIN_SHAPE_RATIO * self._shape_scale):
                 break
             if patch.complete:
                 found = _correlate(grey, template, cv2.TM_CCOEFF_NORMED)

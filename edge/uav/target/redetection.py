@@ -68,10 +68,8 @@ class Redetector:
         strong = (response > _MIN_COLOUR_RESPONSE).astype(np.uint8)
         x, y, width, height = cv2.boundingRect(strong)
         x, y = max(x - side, 0), max(y - side, 0)  # what is beyond has no influence
-        part = response[y : y + height + 2 * side, x : x + width + 2 * side]
-        strong[y : y + len(part), x : x + part.shape[1]] &= part >= cv2.dilate(
-            part, np.ones((2 * side + 1,) * 2, np.uint8)
-        )
+        near = np.s_[y : y + height + 2 * side, x : x + width + 2 * side]
+        strong[near] &= response[near] >= cv2.dilate(response[near], np.ones((2 * side + 1,) * 2, np.uint8))
         rows, columns = np.nonzero(strong)
         order = np.argsort(response[rows, columns], kind="stable")[::-1][:_MAX_BLOBS]
         at = np.column_stack([columns, rows])[order].astype(np.float64)
