@@ -54,7 +54,6 @@ _ROTATED_CANDIDATES = 2  # number of best candidates matched rotated, in turn
 _SAME_ANGLE_COSINE = 0.997  # above which two angles are the same
 _HEADING_STD = 0.06  # of a heading from the template [rad]
 _REDETECT_AFTER = 12  # missed frames after which the full frame is searched
-_REDETECT_EVERY = 2  # frames between two such searches
 # Weight of injected particles per second, and its limit: the target took an unknown path.
 _INJECTION_RATE, _MAX_INJECTED_WEIGHT = 0.002, 0.02
 _DETECTION_PROBABILITIES = (0.03, 0.03, 0.1, 0.3)  # per frame, with 0 to 3 of the car's test points on open road
@@ -171,8 +170,7 @@ class GroundTracker:
     def _measure(self, image: Image, working: Image) -> MeasurementLikelihood:
         """Search the target where the particles lie inside the image, and reweight them."""
         target, localiser = self._target, self._localiser
-        searched = self._missed_frames > _REDETECT_AFTER and self._frame % _REDETECT_EVERY == 0
-        redetected = self._redetect(image, working) if searched else []
+        redetected = self._redetect(image, working) if self._missed_frames > _REDETECT_AFTER else []
         particles = self._particles
         pixels = localiser.target_pixels(particles.position)
         near = localiser.plane.inside(pixels, -0.3 * target.length * target.scale)
