@@ -23,7 +23,7 @@ from protocols.geometry.types import Bools, Floats
 Gray = npt.NDArray[np.uint8]
 
 _WORKING_WIDTH = 430  # approximate width of the image on which Lucas-Kanade runs [px]
-_MAX_TRACKS = 110  # for six unknowns: more cost CPU, fewer leave too few where buildings hide the ground
+_MAX_TRACKS = 96  # for six unknowns: more cost CPU, fewer leave too few where buildings hide the ground
 LK_WINDOW = 13  # px of the working image: smaller ones fail on little texture, larger ones mix roofs and ground
 _SMALL_SURPRISE = 1.5  # px of the working image: with so little left to find, one halving of the image is enough
 _MAX_ITERATIONS = 6  # Gauss-Newton steps, a bound: three narrow the kernel, and it stops where it has converged

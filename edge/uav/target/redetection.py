@@ -64,7 +64,8 @@ class Redetector:
         )
         inner = cv2.blur(ratios, (side, side))
         outer = cv2.blur(ratios, (2 * side + 1, 2 * side + 1))
-        response = np.asarray((inner - 0.5 * outer) / target.appearance.colour_scale, np.float32)
+        gain = 1.0 / target.appearance.colour_scale
+        response = np.asarray(cv2.addWeighted(inner, gain, outer, -0.5 * gain, 0.0), np.float32)
         strong = (response > _MIN_COLOUR_RESPONSE).astype(np.uint8)
         x, y, width, height = cv2.boundingRect(strong)
         x, y = max(x - side, 0), max(y - side, 0)  # what is beyond has no influence
