@@ -23,9 +23,8 @@ from protocols.geometry.types import Bools, Floats
 Gray = npt.NDArray[np.uint8]
 
 _WORKING_WIDTH = 430  # approximate width of the image on which Lucas-Kanade runs [px]
-_MAX_TRACKS = 96  # for six unknowns: more cost CPU, fewer leave too few where buildings hide the ground
+_MAX_TRACKS = 110  # for six unknowns: more cost CPU, fewer leave too few where buildings hide the ground
 LK_WINDOW = 13  # px of the working image: smaller ones fail on little texture, larger ones mix roofs and ground
-_SMALL_SURPRISE = 1.5  # px of the working image: with so little left to find, one halving of the image is enough
 _MAX_ITERATIONS = 6  # Gauss-Newton steps, a bound: three narrow the kernel, and it stops where it has converged
 _CORNER_STD = 0.35  # of a tracked corner [px of the working image]
 _MAX_RESIDUAL = 1.5  # of a corner on the plane [px of the working image]
@@ -65,7 +64,6 @@ class EgoMotion:
         self._ground: Floats = np.zeros((0, 2))
         self._bad_frames: npt.NDArray[np.int64] = np.zeros(0, np.int64)
         self._frames_since_detection = 0
-        self._surprise = np.inf  # median distance of the tracks from their prediction in the last frame [px]
         self.correspondences: tuple[Floats, Floats] = (np.zeros((0, 2)), np.zeros((0, 2)))
         self.frames_without_pose = 0
         """Consecutive frames without a trusted pose."""
@@ -123,8 +121,7 @@ class EgoMotion:
         guess = self._predicted(dt) if predicted is None else predicted
         std = guess.prediction_std(dt, self._distance()) * std_factor
         start = self._project(guess)
-        flow = self._lucas_kanade(gray, start, 1 if self._surprise < _SMALL_SURPRISE else 2)
-        self._surprise = median(np.abs(flow[0] - start)[flow[1]].max(axis=1)) if flow[1].any() else np.inf
+        flow = self._lucas_kanade(gray, start, 2)
         found, good, report = self._track_and_solve(guess, std, (attitude, position), flow)
         if report.inlier_share < 0.6 or report.tracks < 8:
             shift = self._coarse_shift(gray, guess)

@@ -22,7 +22,7 @@ _BITS = 5  # per colour channel in the table
 _BINS = 1 << _BITS
 _SMOOTHING = 0.25  # share of a colour's bin that either neighbour gets
 _MAX_LOG_RATIO = 2.5  # of a pixel's colour
-_MAX_TARGET_CELLS = 26.0  # the target's length in patch cells
+_MAX_TARGET_CELLS = 30.0  # the target's length in patch cells
 _MIN_TARGET_CELLS = 12.0  # the same, at least: cells of 0.4 m still tell a car's windows from its roof
 _MAX_PATCH_CELLS = 200  # per side
 _MIN_SHAPE_RATIO = 0.75  # to the typical shape response: the same car under other illumination
@@ -318,7 +318,7 @@ class AppearanceModel:
         return found
 
     def _shape_response(self, patch: GroundPatch, border: tuple[int, int, int, int]) -> Singles:
-        """Normalised cross-correlation with the adapted template, and the first one where that fits nowhere."""
+        """Normalised cross-correlation with the template, maximum over the first and the adapted one."""
         best = np.zeros(patch.valid.shape, np.float32)
         if self._template is None or self._first_template is None:
             return best
@@ -329,7 +329,7 @@ class AppearanceModel:
             valid, grey = _padded(patch.valid, border), _padded((grey - float(grey.mean())) * patch.valid, border)
             sums = _visible_sums(grey, valid, self._template.shape)
         for number, template in enumerate((self._template, self._first_template)):
-            if number and (template is self._template or best.max() > _MIN_SHAPE_RATIO * self._shape_scale):
+            if number and template is self._template:
                 break
             if patch.complete:
                 found = _correlate(grey, template, cv2.TM_CCOEFF_NORMED)

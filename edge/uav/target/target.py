@@ -53,7 +53,6 @@ class Target:
         self.local_gain = TargetGain()
         self._typical_score = 1.0
         self._learnt_share = 0.0  # visible share when it was learnt
-        self._searched: GroundPatch | None = None  # the last one
         self._learn(image, 1.0)
 
     @property
@@ -101,7 +100,7 @@ class Target:
 
     def search(self, image: Image, centre: Floats, half: float, angle: float | None = None) -> list[Candidate]:
         """Candidates about a ground point."""
-        patch = self._searched = self.patch(image, centre, half, angle)
+        patch = self.patch(image, centre, half, angle)
         return [] if patch is None else self.appearance.candidates(patch)
 
     def align(self, image: Image, fit: MotionFit) -> None:
@@ -123,9 +122,7 @@ class Target:
         """Update the photometric gain at the target if it is complete and its shape matches."""
         if best.visible_share < _FULL_SHARE or not self.appearance.shape_matches(best):
             return
-        patch = self._searched
-        if patch is None or patch.angle != best.angle:  # it was found in another one
-            patch = self.patch(image, best.ground, 0.7)
+        patch = self.patch(image, best.ground, 0.7)
         if patch is not None:
             self.local_gain.update(self.appearance.log_brightness(patch, best.ground))
 
