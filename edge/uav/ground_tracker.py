@@ -7,12 +7,14 @@ road map, and estimate the target state (``estimate_target``).
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from edge.uav.base import Box, Estimate, Telemetry, TrackState
+from edge.uav.ground import colour_table
 from edge.uav.ground.image_plane import apply_homography
 from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.ground.overlay_layers import LazyLayers
@@ -31,7 +33,9 @@ from edge.uav.target.redetection import Redetector
 from edge.uav.target.state_estimate import estimate_target
 from edge.uav.target.target import Target
 from edge.uav.target.tracklets import Tracklet, Tracklets
+from protocols.geometry import kernels
 from protocols.geometry.camera import Intrinsics
+from protocols.geometry.order_statistics import quantile
 from protocols.geometry.types import Floats, Image, Ints
 
 _SAMPLE_SIZE = pf.KldSampleSize(cell=(0.6, 0.6), error=0.05, confidence=0.99, min_count=150, max_count=500)
@@ -53,6 +57,7 @@ _REDETECT_AFTER = 12  # missed frames after which the full frame is searched
 # Weight of injected particles per second, and its limit: the target took an unknown path.
 _INJECTION_RATE, _MAX_INJECTED_WEIGHT = 0.002, 0.02
 _DETECTION_PROBABILITIES = (0.03, 0.03, 0.1, 0.3)  # per frame, with 0 to 3 of the car's test points on open road
+_OPEN_ROAD = -0.3  # log-likelihood ratio of its colour above which a point is open road
 _END_OFFSET = 0.35  # of the outer test points from the centre, over the length
 _LOST_INJECTED_WEIGHT = 0.1  # the same limit once the target is lost
 _TRACKLET_WEIGHT = 0.02  # of the particles injected at a tracklet
@@ -115,7 +120,7 @@ class GroundTracker:
         """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
         if not self._initialised:
             raise RuntimeError("begin first")
-        dt = float(np.clip(time - self._time, 1e-3, 2.0)) if np.isfinite(time) else 1.0 / self._fps
+        dt = min(max(time - self._time, 1e-3), 2.0) if math.isfinite(time) else 1.0 / self._fps
         self._time += dt
         self._frame += 1
         paths = self._occlusion.paths if self._occlusion is not None else []
@@ -174,12 +179,12 @@ class GroundTracker:
             return MeasurementLikelihood.empty()
         near_particles = np.flatnonzero(near)
         weights = particles.weights[near_particles] / share
-        main, main_weight = near_particles, 1.0
+        main, others, main_weight = near_particles, near_particles[:0], 1.0
         if self._missed_frames:
             cluster = pf.densest_cluster(particles.position[near_particles], weights, 2.0 * target.length)
-            main, main_weight = near_particles[cluster.members], cluster.weight
+            main, others = near_particles[cluster.members], near_particles[~cluster.members]
+            main_weight = cluster.weight
         candidates = self._search(image, main, wide=True)
-        others = np.setdiff1d(near_particles, main)
         if len(others) and main_weight < 0.97:
             # Particles outside the main cluster are searched in groups, another group each frame.
             centre = self._rng.choice(others)
@@ -254,7 +259,7 @@ class GroundTracker:
         positions = self._particles.position[members]
         centre = weights @ positions
         distance = np.hypot(*(positions - centre).T)
-        reach = float(np.quantile(distance, 0.97)) if wide else 1.5 * self._target.length
+        reach = quantile(distance, 0.97) if wide else 1.5 * self._target.length
         angle = pf.circular_mean(self._particles.heading[members], weights) if self._target.aligned else None
         if wide:
             self._target.update_resolution(centre)
@@ -321,17 +326,28 @@ class GroundTracker:
         out = np.zeros(len(pixels))
         if not inside.any() or self._localiser.frames_without_pose or not self._road.has_colour_model:
             return np.where(inside & (self._localiser.frames_without_pose == 0), _DETECTION_PROBABILITIES[0], 0.0)
-        axis = np.column_stack([np.cos(particles.heading), np.sin(particles.heading)])[inside]
-        half_length = _END_OFFSET * self._target.length * axis
-        positions = particles.position[inside]
+        open_road = self._open_road(working, particles.position[inside], particles.heading[inside])
+        out[inside] = np.array(_DETECTION_PROBABILITIES)[open_road]
+        return out
+
+    def _open_road(self, working: Image, positions: Floats, headings: Floats) -> Ints:
+        """How many (n,) of a car's middle and ends are on open road, of cars at positions (n, 2) with headings (n,)."""
+        localiser, reach = self._localiser, _END_OFFSET * self._target.length
+        if localiser.plane.compiled:
+            counts, camera = np.empty(len(positions), np.int64), localiser.plane.kernel_arguments(localiser.matrix)
+            image = localiser.downscale, *working.shape[:2], np.ascontiguousarray(working), localiser.photometric.table
+            colours = *self._road.colour_table, _OPEN_ROAD
+            kernels.call("open_road", *camera, len(counts), positions, headings, reach, *image, *colours, counts)
+            return counts
+        half_length = reach * np.column_stack([np.cos(headings), np.sin(headings)])
         points = np.concatenate([positions, positions - half_length, positions + half_length])
         last_pixel = np.array([working.shape[1] - 1, working.shape[0] - 1])
-        ground = np.nan_to_num(self._localiser.pixels(points), nan=-1.0)
-        at = np.clip((ground / self._localiser.downscale).astype(int), 0, last_pixel)
-        colours = self._localiser.photometric.corrected(working[at[:, 1], at[:, 0]][None])[0]
-        open_road = (self._road.log_likelihood_ratios(colours) > -0.3).reshape(3, -1)
-        out[inside] = np.array(_DETECTION_PROBABILITIES)[open_road.sum(axis=0)]
-        return out
+        ground = np.fmax(localiser.pixels(points), -1.0)  # not a number behind the camera
+        at = np.clip((ground / localiser.downscale).astype(int), 0, last_pixel)
+        corrected = localiser.photometric.corrected(working[at[:, 1], at[:, 0]][None])[0]
+        bits, table = self._road.colour_table
+        open_road = colour_table.values(table, corrected, bits) > _OPEN_ROAD
+        return np.asarray(open_road.reshape(3, -1).sum(axis=0), dtype=np.int64)
 
     def _handle_detection(self, image: Image, best: Candidate, measurement: MeasurementLikelihood) -> None:
         """Update motion, position and appearance from a detection."""

@@ -950,3 +950,410 @@ void orientation_cells(integer height, integer width, integer cell, const float 
             for (integer o = 0; o < ORIENTATIONS; o++) out[(o * rows + row) * columns + column] = sums[o] * share;
         }
 }
+
+/* edge.uav.ground.ego_motion._solve_pose: Geman-McClure Gauss-Newton of a camera over the plane, from ground points and
+   their normalised coordinates (n, 2). state: rotation (3, 3) and centre (3,) with k = 6, homography (3, 3) with k = 8;
+   in place. information, prior: (k,). unit: a pixel in normalised coordinates. scratch: (2 n,). */
+void fit_plane_camera(integer n, const double *ground, const double *normalised, integer k, double *state,
+                      const double *information, const double *prior, double unit, double noise, integer iterations,
+                      double *scratch)
+{
+    enum { MOST = 8 };
+    double total[MOST] = {0.0}, width = 0.0, *squared = scratch, *distance = scratch + n;
+    for (integer step = 0; step < iterations; step++) {
+        double h[9], m[MOST * MOST] = {0.0}, delta[MOST] = {0.0}, grown[9], next[9];
+        memcpy(h, state, sizeof h);
+        if (k == 6)
+            for (int r = 0; r < 3; r++)
+                h[3 * r + 2] = -(state[3 * r] * state[9] + state[3 * r + 1] * state[10] + state[3 * r + 2] * state[11]);
+        for (integer i = 0; i < n; i++) {
+            double gx = ground[2 * i], gy = ground[2 * i + 1], z = h[6] * gx + h[7] * gy + h[8];
+            double depth = z > 1e-9 ? z : 1.0, u = normalised[2 * i] - (h[0] * gx + h[1] * gy + h[2]) / depth;
+            double v = normalised[2 * i + 1] - (h[3] * gx + h[4] * gy + h[5]) / depth;
+            squared[i] = u * u + v * v;
+            distance[i] = sqrt(squared[i]);
+        }
+        double middle = median(n, distance);
+        width = step ? at_least(at_least(width * 0.4, 2.5 * middle), 0.3 * unit) : at_least(middle * 1.5, 2.0 * unit);
+        for (integer i = 0; i < n; i++) {
+            double gx = ground[2 * i], gy = ground[2 * i + 1], z = h[6] * gx + h[7] * gy + h[8];
+            if (!(z > 1e-9)) continue;
+            double x = (h[0] * gx + h[1] * gy + h[2]) / z, y = (h[3] * gx + h[4] * gy + h[5]) / z;
+            double u = normalised[2 * i] - x, v = normalised[2 * i + 1] - y, narrow = 1.0 + squared[i] / (width * width);
+            double weight = 1.0 / (narrow * narrow) / (noise * noise);
+            double across[MOST] = {-x * y, 1.0 + x * x, -y}, down[MOST] = {-1.0 - y * y, x * y, x};
+            if (k == 6)
+                for (int c = 0; c < 3; c++) {
+                    across[3 + c] = (x * state[6 + c] - state[c]) / z;
+                    down[3 + c] = (y * state[6 + c] - state[3 + c]) / z;
+                }
+            else {
+                const double of_x[MOST] = {1.0, 0.0, -y, x, x, y, -x * x, -x * y};
+                const double of_y[MOST] = {0.0, 1.0, x, y, -y, x, -x * y, -y * y};
+                memcpy(across, of_x, sizeof across);
+                memcpy(down, of_y, sizeof down);
+            }
+            for (integer a = 0; a < k; a++) {
+                double wx = weight * across[a], wy = weight * down[a];
+                for (integer b = a; b < k; b++) m[a * k + b] += wx * across[b] + wy * down[b];
+                delta[a] += wx * u + wy * v;
+            }
+        }
+        for (integer a = 0; a < k; a++) {
+            for (integer b = 0; b < a; b++) m[a * k + b] = m[b * k + a];
+            m[a * k + a] += information[a];
+            delta[a] += information[a] * (prior[a] - total[a]);
+        }
+        solve(k, m, delta); /* definite: the prior alone is */
+        for (integer a = 0; a < k; a++) total[a] += delta[a];
+        if (k == 6) {
+            rotation_of(delta, grown);
+            for (int c = 0; c < 3; c++) state[9 + c] += delta[3 + c];
+        } else {
+            const double of[9] = {1.0 + delta[3] + delta[4], delta[5] - delta[2], delta[0],
+                                  delta[2] + delta[5], 1.0 + delta[3] - delta[4], delta[1], delta[6], delta[7], 1.0};
+            memcpy(grown, of, sizeof grown);
+        }
+        for (int r = 0; r < 3; r++)
+            for (int c = 0; c < 3; c++)
+                next[3 * r + c] = grown[3 * r] * state[c] + grown[3 * r + 1] * state[3 + c] + grown[3 * r + 2] * state[6 + c];
+        double root = k == 6 ? 1.0
+                             : cbrt(next[0] * (next[4] * next[8] - next[5] * next[7])
+                                    - next[1] * (next[3] * next[8] - next[5] * next[6])
+                                    + next[2] * (next[3] * next[7] - next[4] * next[6]));
+        for (int c = 0; c < 9; c++) state[c] = next[c] / root;
+        if (step >= 2 && at_least(fabs(delta[0]), fabs(delta[1])) < 0.01 * unit) break;
+    }
+}
+
+/* A pinhole with Brown's distortion over a plane. homography: (3, 3), normalised from ground. */
+typedef struct {
+    const double *homography, *matrix, *coefficients;
+    double fold, radius;
+} plane_camera_t;
+
+/* The pixel (2,) of a ground point; beyond ``radius`` the distortion stays what it is there; NaN behind. */
+static INLINE void ground_pixel(const plane_camera_t *camera, double gx, double gy, double *pixel)
+{
+    const double *h = camera->homography, *m = camera->matrix;
+    double z = h[6] * gx + h[7] * gy + h[8];
+    if (!(z > 1e-9)) z = NAN;
+    double x = (h[0] * gx + h[1] * gy + h[2]) / z, y = (h[3] * gx + h[4] * gy + h[5]) / z;
+    pixel[0] = m[0] * x + m[1] * y + m[2];
+    pixel[1] = m[3] * x + m[4] * y + m[5];
+    if (!camera->coefficients) return;
+    double from = sqrt(x * x + y * y), share = from > camera->radius ? camera->radius / from : 1.0;
+    double flat[2] = {share * x, share * y}, bent[2], unused[4];
+    if (!(flat[0] * flat[0] + flat[1] * flat[1] < camera->fold * camera->fold)) return; /* nothing to continue */
+    brown_distortion(1, flat, camera->coefficients, bent, unused);
+    pixel[0] += m[0] * (bent[0] - flat[0]) + m[1] * (bent[1] - flat[1]);
+    pixel[1] += m[3] * (bent[0] - flat[0]) + m[4] * (bent[1] - flat[1]);
+}
+
+/* edge.uav.ground.image_plane.ImagePlane.project: pixels (n, 2) of ground points (n, 2). */
+void ground_pixels(const double *homography, const double *matrix, const double *coefficients, double fold,
+                   double radius, integer n, const double *points, double *pixels)
+{
+    const plane_camera_t camera = {homography, matrix, coefficients, fold, radius};
+    for (integer i = 0; i < n; i++) ground_pixel(&camera, points[2 * i], points[2 * i + 1], pixels + 2 * i);
+}
+
+/* Bin of a colour of three bytes, with ``bits`` of each. */
+static INLINE integer colour_bin(const uint8_t *colour, integer bits)
+{
+    const integer shift = 8 - bits;
+    return ((integer)(colour[0] >> shift) << (2 * bits)) + ((integer)(colour[1] >> shift) << bits) + (colour[2] >> shift);
+}
+
+/* edge.uav.ground.colour_table.values: table (bins^3,) at colours (n, 3). */
+void colour_values(integer n, const uint8_t *colours, integer bits, const float *table, float *out)
+{
+    for (integer i = 0; i < n; i++) out[i] = table[colour_bin(colours + 3 * i, bits)];
+}
+
+/* edge.uav.ground.colour_table.histogram (bins^3,) of colours (n, 3) with weights (n,), unless null; smoothed along each
+   axis: ``centre`` of itself and ``side`` of either neighbour. */
+void colour_histogram(integer n, const uint8_t *colours, const double *weights, integer bits, double centre,
+                      double side, double *out)
+{
+    const integer bins = (integer)1 << bits, size = bins * bins * bins;
+    memset(out, 0, sizeof(double) * (size_t)size);
+    for (integer i = 0; i < n; i++) out[colour_bin(colours + 3 * i, bits)] += weights ? weights[i] : 1.0;
+    for (integer step = bins * bins; step; step /= bins) /* planes, then rows, then single values */
+        for (integer base = 0; base < size; base += bins * step) {
+            double before[1024], *at = out + base;
+            for (integer c = 0; c < step; c++) before[c] = 0.0;
+            for (integer k = 0; k < bins; k++, at += step)
+                for (integer c = 0; c < step; c++) {
+                    double value = at[c], after = k + 1 < bins ? at[step + c] : 0.0;
+                    at[c] = centre * value + side * (before[c] + after);
+                    before[c] = value;
+                }
+        }
+}
+
+/* Means (h / factor, w / factor, 3) of an image (h, w, 3), rounded as cv2.resize with INTER_AREA does. sums: (3 w,). */
+WIDE void reduce_image(integer height, integer width, integer factor, const uint8_t *image, uint16_t *sums,
+                       uint8_t *out)
+{
+    const integer rows = height / factor, columns = width / factor, line = 3 * width;
+    const float share = 1.0f / (float)(factor * factor), round_even = 12582912.0f; /* leaves no bits for a fraction */
+    for (integer row = 0; row < rows; row++) {
+        const uint8_t *from = image + row * factor * line;
+        for (integer c = 0; c < line; c++) sums[c] = from[c];
+        for (integer k = 1; k < factor; k++)
+            for (integer c = 0; c < line; c++) sums[c] = (uint16_t)(sums[c] + from[k * line + c]);
+        for (integer column = 0; column < columns; column++)
+            for (integer c = 0; c < 3; c++) {
+                const uint16_t *at = sums + 3 * factor * column + c;
+                integer total = 0;
+                for (integer k = 0; k < factor; k++) total += at[3 * k];
+                float rounded = (float)total * share + round_even;
+                *out++ = (uint8_t)(rounded - round_even);
+            }
+    }
+}
+
+/* Index of n in an image that is continued by its border value, and by its mirror image (OpenCV's default). */
+static INLINE integer clamped(integer k, integer n) { return k < 0 ? 0 : k < n ? k : n - 1; }
+static INLINE integer mirrored(integer k, integer n) { return clamped(k < 0 ? -k : k < n ? k : 2 * n - 2 - k, n); }
+
+/* edge.uav.ground.photometric: colours (n, c) at points (n, 2) of an image (h, w, c) blurred over 5 x 5 px, as cv2.blur
+   and cv2.remap give them. */
+void blurred_colours(integer n, const float *points, integer height, integer width, integer channels,
+                     const uint8_t *image, double *out)
+{
+    for (integer i = 0; i < n; i++) {
+        const float left = floorf(points[2 * i]), top = floorf(points[2 * i + 1]);
+        const float fx = points[2 * i] - left, fy = points[2 * i + 1] - top;
+        const integer x = (integer)left, y = (integer)top;
+        integer rows[2][5], columns[2][5];
+        for (integer u = 0; u < 2; u++)
+            for (integer k = 0; k < 5; k++) {
+                rows[u][k] = mirrored(clamped(y + u, height) + k - 2, height) * width * channels;
+                columns[u][k] = mirrored(clamped(x + u, width) + k - 2, width) * channels;
+            }
+        for (integer c = 0; c < channels; c++) {
+            float blurred[2][2];
+            for (integer v = 0; v < 2; v++)
+                for (integer u = 0; u < 2; u++) {
+                    int total = 0;
+                    for (integer k = 0; k < 5; k++)
+                        for (integer j = 0; j < 5; j++) total += image[rows[v][k] + columns[u][j] + c];
+                    blurred[v][u] = (float)((2 * total + 25) / 50);
+                }
+            out[i * channels + c] = blurred[0][0] * ((1.0f - fy) * (1.0f - fx)) + blurred[0][1] * ((1.0f - fy) * fx)
+                                    + blurred[1][0] * (fy * (1.0f - fx)) + blurred[1][1] * (fy * fx);
+        }
+    }
+}
+
+/* edge.uav.target.motion_history.MotionHistory.fit: position, velocity and acceleration (3, 2) of positions (n, 2) at
+   times (n,) before now, in three steps with Cauchy weights. information: (3,), right: (3, 2) of the prior. Left are the
+   last normal matrix (3, 3), errors (n,) and weights (n,). */
+void fit_motion(integer n, const double *time, const double *positions, const double *stds, const double *information,
+                const double *right, double *weight, double *solution, double *normal, double *error)
+{
+    for (int step = 0; step < 3; step++) {
+        double m[9], values[2][3];
+        for (int a = 0; a < 3; a++)
+            for (int c = 0; c < 2; c++) values[c][a] = right[2 * a + c];
+        memset(normal, 0, sizeof m);
+        for (int a = 0; a < 3; a++) normal[4 * a] = information[a];
+        for (integer i = 0; i < n; i++) {
+            const double row[3] = {1.0, time[i], 0.5 * time[i] * time[i]};
+            for (int a = 0; a < 3; a++) {
+                for (int b = 0; b < 3; b++) normal[3 * a + b] += row[a] * weight[i] * row[b];
+                for (int c = 0; c < 2; c++) values[c][a] += row[a] * weight[i] * positions[2 * i + c];
+            }
+        }
+        for (int c = 0; c < 2; c++) {
+            memcpy(m, normal, sizeof m);
+            solve(3, m, values[c]); /* definite: the prior alone is */
+            for (int a = 0; a < 3; a++) solution[2 * a + c] = values[c][a];
+        }
+        for (integer i = 0; i < n; i++) {
+            double half = 0.5 * time[i] * time[i], dx = solution[0] + time[i] * solution[2] + half * solution[4];
+            double dy = solution[1] + time[i] * solution[3] + half * solution[5];
+            dx -= positions[2 * i];
+            dy -= positions[2 * i + 1];
+            error[i] = sqrt(dx * dx + dy * dy);
+            double ratio = error[i] / (3.0 * stds[i]);
+            weight[i] = 1.0 / (stds[i] * stds[i]) / (1.0 + ratio * ratio);
+        }
+    }
+}
+
+/* A grid of values (rows, columns) whose first cell begins at (x, y). */
+typedef struct {
+    double x, y, cell;
+    integer rows, columns;
+    const float *values;
+} grid_t;
+
+/* Its value at a point; 0 outside. */
+static INLINE double grid_value(const grid_t *grid, double px, double py)
+{
+    double column = floor((px - grid->x) / grid->cell), row = floor((py - grid->y) / grid->cell);
+    if (!(column >= 0.0 && row >= 0.0 && column < (double)grid->columns && row < (double)grid->rows)) return 0.0;
+    return grid->values[(integer)row * grid->columns + (integer)column];
+}
+
+/* edge.uav.ground.road_map.RoadMap: values (n,) at points (n, 2). */
+void grid_values(double x, double y, double cell, integer rows, integer columns, const float *values, integer n,
+                 const double *points, double *out)
+{
+    const grid_t grid = {x, y, cell, rows, columns, values};
+    for (integer i = 0; i < n; i++) out[i] = grid_value(&grid, points[2 * i], points[2 * i + 1]);
+}
+
+/* edge.uav.prediction.paths.road_edges: distances (2, n), right and left, of ``count`` with ``step`` between them. */
+void road_edges(double x, double y, double cell, integer rows, integer columns, const float *values, integer n,
+                const double *points, const double *headings, integer count, double step, double off, double unknown,
+                integer most_unknown, double *out)
+{
+    const grid_t grid = {x, y, cell, rows, columns, values};
+    for (integer side = 0; side < 2; side++)
+        for (integer i = 0; i < n; i++) {
+            double across = sin(headings[i]), along = cos(headings[i]), *to = out + side * n + i;
+            integer blank = 0;
+            *to = NAN;
+            for (integer k = 0; k < count; k++) {
+                double reach = side ? -step * (double)k : step * (double)k;
+                double odds = grid_value(&grid, points[2 * i] - reach * across, points[2 * i + 1] + reach * along);
+                blank += fabs(odds) < unknown;
+                if (!(odds < off)) continue;
+                if (k && blank <= most_unknown) *to = fabs(reach);
+                break;
+            }
+        }
+}
+
+/* edge.uav.prediction.paths._look_ahead: of points (arcs, steps, offsets) in the axes of a car at (px, py), mean weighted
+   values (arcs,) within limits, shares that are known (arcs,), and whether any is in the first steps. */
+void arc_values(double x, double y, double cell, integer rows, integer columns, const float *values, integer arcs,
+                integer steps, integer offsets, const double *forward, const double *lateral, const double *weights,
+                double px, double py, double heading, double known, const double *limits, integer first, double *out)
+{
+    const grid_t grid = {x, y, cell, rows, columns, values};
+    const double c = cos(heading), s = sin(heading), many = (double)(steps * offsets);
+    double *seen = out + arcs, *near = out + 2 * arcs;
+    *near = 0.0;
+    for (integer arc = 0; arc < arcs; arc++) {
+        double total = 0.0, count = 0.0;
+        for (integer step = 0; step < steps; step++)
+            for (integer k = 0; k < offsets; k++) {
+                double ahead = *forward++, aside = *lateral++;
+                double odds = grid_value(&grid, px + c * ahead - s * aside, py + s * ahead + c * aside);
+                int observed = fabs(odds) > known;
+                if (observed && step < first) *near = 1.0;
+                count += observed;
+                total += weights[step] * (observed ? at_least(odds < limits[1] ? odds : limits[1], limits[0]) : limits[2]);
+            }
+        out[arc] = total / many;
+        seen[arc] = count / many;
+    }
+}
+
+/* edge.uav.prediction.particle_filter.densest_cluster of points (n, 2): members (n,), centre (2,) and weight in out.
+   scratch: (2, n). */
+WIDE void densest_cluster(integer n, const double *points, const double *weights, double radius, double *scratch,
+                          uint8_t *members, double *out)
+{
+    double *column = scratch, *row = scratch + n, best = -1.0, x = 0.0, y = 0.0, total = 0.0;
+    integer fullest = 0;
+    for (integer i = 0; i < n; i++) {
+        column[i] = floor(points[2 * i] / radius);
+        row[i] = floor(points[2 * i + 1] / radius);
+    }
+    for (integer i = 0; i < n; i++) {
+        double around = 0.0;
+        for (integer j = 0; j < n; j++) {
+            double dx = fabs(column[j] - column[i]), dy = fabs(row[j] - row[i]);
+            around += (dx <= 1.0) & (dy <= 1.0) ? weights[j] * (dx + dy > 0.0 ? 1.0 : 1.0 + 1e-9) : 0.0;
+        }
+        if (around > best) best = around, fullest = i;
+    }
+    for (integer i = 0; i < n; i++) {
+        members[i] = column[i] == column[fullest] && row[i] == row[fullest];
+        if (!members[i]) continue;
+        double weight = weights[i] + 1e-300;
+        x += weight * points[2 * i];
+        y += weight * points[2 * i + 1];
+        total += weight;
+    }
+    x /= total;
+    y /= total;
+    for (int step = 0; step < 10; step++) {
+        double sum = 0.0, sum_x = 0.0, sum_y = 0.0;
+        integer changed = 0;
+        for (integer i = 0; i < n; i++) {
+            double dx = points[2 * i] - x, dy = points[2 * i + 1] - y;
+            uint8_t within = dx * dx + dy * dy <= radius * radius;
+            scratch[i] = within;
+            changed += within != members[i];
+            sum += within ? weights[i] : 0.0;
+            sum_x += within ? weights[i] * points[2 * i] : 0.0;
+            sum_y += within ? weights[i] * points[2 * i + 1] : 0.0;
+        }
+        if (!(sum > 0.0) || !changed) break;
+        for (integer i = 0; i < n; i++) members[i] = scratch[i] != 0.0;
+        x = sum_x / sum;
+        y = sum_y / sum;
+    }
+    out[0] = x;
+    out[1] = y;
+    out[2] = 0.0;
+    for (integer i = 0; i < n; i++) out[2] += members[i] ? weights[i] : 0.0;
+}
+
+/* edge.uav.ground_tracker.GroundTracker._open_road: of each car at positions (n, 2), how many of its middle and its ends,
+   ``reach`` away along its heading, have a colour with a value above ``least`` in the reduced image (h, w, 3). levels:
+   (256, 3) that take the place of the image's, or null. */
+void open_road(const double *homography, const double *matrix, const double *coefficients, double fold, double radius,
+               integer n, const double *positions, const double *headings, double reach, double factor, integer height,
+               integer width, const uint8_t *image, const uint8_t *levels, integer bits, const float *table,
+               double least, integer *counts)
+{
+    const plane_camera_t camera = {homography, matrix, coefficients, fold, radius};
+    for (integer i = 0; i < n; i++) {
+        double dx = reach * cos(headings[i]), dy = reach * sin(headings[i]), pixel[2];
+        counts[i] = 0;
+        for (int end = -1; end <= 1; end++) {
+            ground_pixel(&camera, positions[2 * i] + end * dx, positions[2 * i + 1] + end * dy, pixel);
+            double x = pixel[0] / factor, y = pixel[1] / factor;
+            integer column = x > 0.0 ? (integer)(x < (double)width ? x : (double)(width - 1)) : 0;
+            integer row = y > 0.0 ? (integer)(y < (double)height ? y : (double)(height - 1)) : 0;
+            uint8_t colour[3];
+            for (int c = 0; c < 3; c++) {
+                colour[c] = image[3 * (row * width + column) + c];
+                if (levels) colour[c] = levels[3 * colour[c] + c];
+            }
+            counts[i] += table[colour_bin(colour, bits)] > (float)least;
+        }
+    }
+}
+
+/* edge.uav.ground.road_map.RoadMap.update: of a map (rows, columns), values of the colours of its cells in an image
+   (h, w, 3), by a table; 0 within two pixels of its border and beyond. pixels: (m, k, 2) of a mesh over the map, linear
+   between its points. scratch: (2 k + columns,). */
+void road_evidence(integer m, integer k, const double *pixels, integer rows, integer columns, integer height,
+                   integer width, const uint8_t *image, integer bits, const float *table, double *scratch, float *out)
+{
+    double *line = scratch, *place = scratch + 2 * k;
+    for (integer column = 0; column < columns; column++)
+        place[column] = (double)column * (double)(k - 1) / (double)(columns - 1);
+    for (integer row = 0; row < rows; row++) {
+        double down = (double)row * (double)(m - 1) / (double)(rows - 1);
+        integer low = clamped((integer)down, m - 1);
+        const double *from = pixels + 2 * k * low, part = down - (double)low;
+        for (integer c = 0; c < 2 * k; c++) line[c] = from[c] + part * (from[2 * k + c] - from[c]);
+        for (integer column = 0; column < columns; column++) {
+            integer left = clamped((integer)place[column], k - 1);
+            const double *at = line + 2 * left, share = place[column] - (double)left;
+            double x = at[0] + share * (at[2] - at[0]), y = at[1] + share * (at[3] - at[1]);
+            int inside = (x > 1.0) & (y > 1.0) & (x < (double)(width - 2)) & (y < (double)(height - 2));
+            *out++ = inside ? table[colour_bin(image + 3 * ((integer)(y + 0.5) * width + (integer)(x + 0.5)), bits)] : 0.0f;
+        }
+    }
+}

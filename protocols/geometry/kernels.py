@@ -10,9 +10,10 @@ import os
 from collections.abc import Sequence
 from ctypes import CDLL, addressof, c_char, c_double, c_int64, c_void_p
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from protocols.geometry.types import Bools, Floats, Ints, Singles
 
@@ -33,6 +34,19 @@ _SIGNATURES = {
     "homography_residual": "nppnp",
     "match_layouts": "nppnpp",
     "orientation_cells": "nnnppp",
+    "fit_plane_camera": "nppnpppddnp",
+    "ground_pixels": "pppddnpp",
+    "open_road": "pppddnppddnnppnpdp",
+    "colour_values": "npnpp",
+    "colour_histogram": "nppnddp",
+    "reduce_image": "nnnppp",
+    "blurred_colours": "npnnnpp",
+    "fit_motion": "nppppppppp",
+    "road_evidence": "nnpnnnnpnppp",
+    "grid_values": "dddnnpnpp",
+    "road_edges": "dddnnpnppndddnp",
+    "arc_values": "dddnnpnnnpppddddpnp",
+    "densest_cluster": "nppdppp",
 }
 """Of each function: counts n, doubles d and pointers p."""
 
@@ -54,13 +68,19 @@ _found = None if os.environ.get("SYNCLINE_PURE") else load(Path(__file__).with_n
 AVAILABLE, _library = _found is not None, cast(CDLL, _found)
 
 
-def _at(array: Floats | Ints | Bools | Singles) -> int:
+def _at(array: npt.NDArray[Any]) -> int:
     """The address of an array, which is contiguous and outlives the call."""
     try:
         return addressof(c_char.from_buffer(array))  # type: ignore[arg-type]  # a third of the time of numpy's own
     except (TypeError, ValueError):  # read-only or empty
         assert array.flags.c_contiguous, "a kernel would read beside the array"
         return array.ctypes.data
+
+
+def call(name: str, *given: npt.NDArray[Any] | float | None) -> float:
+    """Call a function of kernels.c with numbers and arrays, which are contiguous and of its types; None is null."""
+    arguments = [one if one is None or isinstance(one, int | float) else _at(one) for one in given]
+    return cast(float, getattr(_library, name)(*arguments))
 
 
 def _rows_last(points: Floats) -> Floats:
@@ -78,10 +98,8 @@ def spline_weights(
     time, count = np.ascontiguousarray(time, dtype=np.float64), len(time)
     index, inside = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.bool_)
     weights, derivatives = np.empty((4, count)), np.empty((4, count if slopes else 0))
-    to = _at(derivatives) if slopes else 0
-    _library.spline_weights(
-        count, _at(time), basis.shape[1], _at(basis), extrapolation, _at(index), _at(weights), to, _at(inside)
-    )
+    to = index, weights, derivatives if slopes else None, inside
+    call("spline_weights", count, time, basis.shape[1], basis, extrapolation, *to)
     return index, weights, derivatives, inside
 
 
@@ -96,8 +114,8 @@ def label_weights(
     index, inside = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.bool_)
     weights, slopes = np.empty((2, 4, count))
     tables = np.array([(_at(one), one.shape[1], first) for one, first in bases], dtype=np.int64)
-    to = _at(index), _at(weights), _at(slopes), _at(inside)
-    _library.label_weights(count, _at(time), len(ends), _at(ends), _at(tables), extrapolation, *to)
+    to = index, weights, slopes, inside
+    call("label_weights", count, time, len(ends), ends, tables, extrapolation, *to)
     return index, weights, slopes, inside
 
 
@@ -105,9 +123,7 @@ def spline_values(basis: Floats, time: Floats, polynomials: Floats) -> tuple[Flo
     """Values and slopes (d, n) at time (n,); NaN outside. polynomials: (4, d, m)."""
     time, (_, width, size) = np.ascontiguousarray(time, dtype=np.float64), polynomials.shape
     values, slopes = np.empty((2, width, len(time)))
-    _library.spline_values(
-        len(time), _at(time), basis.shape[1], _at(basis), width, size, _at(polynomials), _at(values), _at(slopes)
-    )
+    call("spline_values", len(time), time, basis.shape[1], basis, width, size, polynomials, values, slopes)
     return values, slopes
 
 
@@ -116,7 +132,7 @@ def weighted_sums(control: Floats, index: Ints, weights: Floats) -> Floats:
     control, weights = np.ascontiguousarray(control, dtype=np.float64), np.ascontiguousarray(weights)
     index = np.ascontiguousarray(index, dtype=np.int64)
     out = np.empty((control.shape[1], len(index)))
-    _library.weighted_sums(len(index), control.shape[1], _at(control), _at(index), _at(weights), _at(out))
+    call("weighted_sums", len(index), control.shape[1], control, index, weights, out)
     return out
 
 
@@ -131,8 +147,8 @@ def spline_normal(
     weights, values = np.ascontiguousarray(rows[1]), np.ascontiguousarray(values, dtype=np.float64)
     width = values.shape[1]
     bands, target = np.zeros((4, size)), np.zeros((width, size))
-    given = _at(index), _at(weights), _at(row_weight), width, _at(values), basis.shape[1], _at(basis)
-    _library.spline_normal(len(index), *given, stiffness, size, _at(bands), _at(target))
+    given = index, weights, row_weight, width, values, basis.shape[1], basis
+    call("spline_normal", len(index), *given, stiffness, size, bands, target)
     return bands, target
 
 
@@ -156,15 +172,14 @@ def add_rows(
     index, weights = np.ascontiguousarray(index, dtype=np.int64), np.ascontiguousarray(weights)
     terms, width = np.ascontiguousarray(terms), terms.shape[1] - 3
     tables = np.array([(first, _at(sums), low, _at(crossed)) for first, sums, low, crossed in to], dtype=np.int64)
-    given = _at(ends), _at(index), _at(weights), width, _at(terms)
-    _library.add_rows(len(ends), _at(tables), *given, _at(gram))
+    call("add_rows", len(ends), tables, ends, index, weights, width, terms, gram)
 
 
 def brown_distortion(normalised: Floats, coefficients: Floats) -> tuple[Floats, Floats]:
     """Distorted coordinates (2, n) of normalised ones (n, 2), and their Jacobian (2, 2, n)."""
     normalised, coefficients = _rows_last(normalised), np.ascontiguousarray(coefficients, dtype=np.float64)
     out, jacobian = np.empty(normalised.shape), np.empty((2, *normalised.shape))
-    _library.brown_distortion(normalised.shape[1], _at(normalised), _at(coefficients), _at(out), _at(jacobian))
+    call("brown_distortion", normalised.shape[1], normalised, coefficients, out, jacobian)
     return out, jacobian
 
 
@@ -181,9 +196,8 @@ def project_points(
         np.ascontiguousarray(one, dtype=np.float64) for one in (*pose, *lens[:2])
     )
     seen, out, flat, pixels = looked_at.copy(), np.empty((3, count)), np.empty((2, count)), np.empty((2, count))
-    jacobian, given = np.empty((2, 2, count)), (_at(rotation), _at(position), _at(matrix), _at(coefficients), lens[2])
-    to = _at(out), _at(flat), _at(pixels), _at(jacobian), _at(seen)
-    _library.project_points(count, _at(points), *given, *to)
+    jacobian, given = np.empty((2, 2, count)), (rotation, position, matrix, coefficients, lens[2])
+    call("project_points", count, points, *given, out, flat, pixels, jacobian, seen)
     return out, flat, pixels, jacobian, seen
 
 
@@ -202,10 +216,8 @@ def pose_jacobians(
     """
     count, by_time = out.shape[2], np.empty((2, out.shape[2] if velocity is not None else 0))
     rotation, matrix = (np.ascontiguousarray(one, dtype=np.float64) for one in (rotation, matrix))
-    kept = [np.ascontiguousarray(one) for one in (*rows, *([] if velocity is None else [velocity]))]
-    moving = 0 if velocity is None else _at(kept[4])
-    given = _at(rotation), _at(matrix), *(_at(one) for one in kept[:4]), moving, _at(place)
-    _library.pose_jacobians(count, *given, out.shape[1], _at(by_time), _at(out))
+    kept = [None if one is None else np.ascontiguousarray(one) for one in (*rows, velocity)]
+    call("pose_jacobians", count, rotation, matrix, *kept, place, out.shape[1], by_time, out)
     return by_time
 
 
@@ -256,7 +268,7 @@ def smallest_eigenvalues(
     """Smallest generalised eigenvalues (m,) of moments (6, 6, m) under Taubin's normalisation."""
     moments, count = np.ascontiguousarray(moments), moments.shape[2]
     out = np.empty(count)
-    _library.smallest_eigenvalues(count, _at(moments), sigma_a**2, sigma_b**2, iterations, min_orthogonal, _at(out))
+    call("smallest_eigenvalues", count, moments, sigma_a**2, sigma_b**2, iterations, min_orthogonal, out)
     return out
 
 
@@ -264,7 +276,7 @@ def neighbour_scores(time: Floats, points: Floats, rows: Ints, one_sided: bool, 
     """Quantile ``share`` (n,) of each point's distances from lines through two of the good ones ``rows``."""
     time, points = np.ascontiguousarray(time), np.ascontiguousarray(points)
     out = np.empty(len(time))
-    _library.neighbour_scores(len(time), _at(time), _at(points), len(rows), _at(rows), int(one_sided), share, _at(out))
+    call("neighbour_scores", len(time), time, points, len(rows), rows, int(one_sided), share, out)
     return out
 
 
@@ -272,8 +284,7 @@ def homography_residual(a: Floats, b: Floats, iterations: int) -> float:
     """Median distance of points b (n, 2) from a mapped by the best homography, in b's unit."""
     count, scratch = len(a), np.empty(6 * len(a))
     a, b = _rows_last(a), _rows_last(b)
-    found: float = _library.homography_residual(count, _at(a), _at(b), iterations, _at(scratch))
-    return found
+    return call("homography_residual", count, a, b, iterations, scratch)
 
 
 def match_layouts(payloads: Sequence[bytes], tables: Ints) -> bytearray:
@@ -287,4 +298,4 @@ def match_layouts(payloads: Sequence[bytes], tables: Ints) -> bytearray:
 def orientation_cells(magnitude: Singles, angle: Singles, cell: int, out: Singles) -> None:
     """Into ``out`` (9, h / cell, w / cell) the means over cells of gradients (h, w) by orientation. angle: [rad]."""
     height, width = magnitude.shape
-    _library.orientation_cells(height, width, cell, _at(magnitude), _at(angle), _at(out))
+    call("orientation_cells", height, width, cell, magnitude, angle, out)

@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
 from edge.uav.ground.plane_pose import PlaneCamera, PlaneHomography, PlanePose
-from protocols.geometry import so3
+from protocols.geometry import kernels, so3
+from protocols.geometry.order_statistics import median
 from protocols.geometry.types import Bools, Floats
 
 Gray = npt.NDArray[np.uint8]
@@ -73,6 +74,10 @@ class EgoMotion:
             return image
         height, width = image.shape[:2]
         working_size = (width // self.downscale, height // self.downscale)
+        if kernels.AVAILABLE and self.downscale > 2:  # half the size is fast in OpenCV
+            out, sums = np.empty((working_size[1], working_size[0], 3), np.uint8), np.empty(3 * width, np.uint16)
+            kernels.call("reduce_image", height, width, self.downscale, np.ascontiguousarray(image), sums, out)
+            return out
         whole = image[: working_size[1] * self.downscale, : working_size[0] * self.downscale]
         return np.asarray(cv2.resize(whole, working_size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
@@ -115,13 +120,12 @@ class EgoMotion:
         assert self._gray is not None
         guess = self._predicted(dt) if predicted is None else predicted
         std = guess.prediction_std(dt, self._distance()) * std_factor
-        found, good, report = self._track_and_solve(
-            guess, std, (attitude, position), self._lucas_kanade(gray, self._project(guess), 2)
-        )
+        start = self._project(guess)
+        flow = self._lucas_kanade(gray, start, 2)
+        found, good, report = self._track_and_solve(guess, std, (attitude, position), flow)
         if report.inlier_share < 0.6 or report.tracks < 8:
             shift = self._coarse_shift(gray, guess)
             wide = std * 8.0
-            start = self._project(guess)
             second = self._track_and_solve(guess, wide, (None, None), self._lucas_kanade(gray, start + shift, 3))
             if second[2].inlier_share * min(second[2].tracks, 30) > report.inlier_share * min(report.tracks, 30):
                 found, good, report = second
@@ -172,7 +176,7 @@ class EgoMotion:
 
     def _project(self, pose: PlanePose | PlaneHomography) -> Floats:
         """Projections of the tracks' ground points into the working image."""
-        return self._to_working(self._plane.pixels(apply_homography(pose.matrix, self._ground)))
+        return self._to_working(self._plane.project(pose.matrix, self._ground))
 
     def _lucas_kanade(self, gray: Gray, start: Floats, levels: int) -> tuple[npt.NDArray[np.float32], Bools]:
         """Pyramidal Lucas-Kanade from ``start`` (n, 2); pixels (n, 2) and which were found."""
@@ -220,11 +224,11 @@ class EgoMotion:
         error = np.linalg.norm(apply_homography(pose.matrix, ground) - normalised, axis=1) / unit
         good, inliers = np.zeros(len(at), bool), np.zeros(len(at), bool)
         good[followed] = error < _MAX_RESIDUAL
-        inliers[followed] = error < np.clip(4.0 * float(np.median(error)), 0.5, _MAX_RESIDUAL)
+        inliers[followed] = error < min(max(4.0 * median(error), 0.5), _MAX_RESIDUAL)
         # Tracks outside the image are not counted; those expected inside but not found are.
         number = int(good.sum())
         inlier_share = number / max(int(followed.sum()), 1)
-        residual = float(np.median(error[error < _MAX_RESIDUAL])) if number else float("inf")
+        residual = median(error[error < _MAX_RESIDUAL]) if number else float("inf")
         trusted = number >= 6 and (inlier_share >= 0.35 or number >= 25)
         return pose, (at, followed, inliers), EgoMotionReport(inlier_share, number, residual, trusted)
 
@@ -250,8 +254,8 @@ class EgoMotion:
         spacing = max(5, width // 26)
         mask = np.full((height, width), 255, np.uint8)
         mask[:6], mask[-6:], mask[:, :6], mask[:, -6:] = 0, 0, 0, 0
-        for x, y in self._pixels:
-            cv2.circle(mask, (int(x), int(y)), spacing, 0, -1)
+        for centre in self._pixels.astype(int).tolist():
+            cv2.circle(mask, centre, spacing, 0, -1)
         if excluded is not None and np.isfinite(excluded).all():
             corners = np.clip(self._to_working(excluded), -1e4, 1e4).astype(np.int32)
             cv2.fillConvexPoly(mask, cv2.convexHull(corners[:, None]), 0)
@@ -311,6 +315,13 @@ def _solve_pose(
             _fuse(information, prior, slice(3, 6), position[0] - guess.centre, position[1])
     pose, total = guess, np.zeros(len(std))
     noise = _CORNER_STD * unit
+    if kernels.AVAILABLE:
+        whole = (guess.rotation, guess.centre) if isinstance(guess, PlanePose) else (guess.matrix,)
+        state, given = np.concatenate([part.ravel() for part in whole]), (len(ground), ground, normalised, len(std))
+        limits = unit, noise, _MAX_ITERATIONS
+        kernels.call("fit_plane_camera", *given, state, information, prior, *limits, np.empty(2 * len(ground)))
+        parts = state[:9].reshape(3, 3), state[9:]
+        return PlanePose(*parts) if isinstance(guess, PlanePose) else PlaneHomography(parts[0])
     for step in range(_MAX_ITERATIONS):
         h = pose.matrix
         p = ground @ h[:, :2].T + h[:, 2]
@@ -320,10 +331,10 @@ def _solve_pose(
         residual = normalised - at
         squared = residual[:, 0] ** 2 + residual[:, 1] ** 2
         if step == 0:
-            width = max(float(np.median(np.sqrt(squared))) * 1.5, 2.0 * unit)
+            width = max(median(np.sqrt(squared)) * 1.5, 2.0 * unit)
         else:
             # Raised objects move slightly more than the ground: a narrow kernel keeps roofs from biasing the pose.
-            width = max(width * 0.4, 2.5 * float(np.median(np.sqrt(squared))), 0.3 * unit)
+            width = max(width * 0.4, 2.5 * median(np.sqrt(squared)), 0.3 * unit)
         weight = np.where(front, 1.0 / np.square(1.0 + squared / (width * width)), 0.0) / (noise * noise)
         j = pose.jacobian(ground, at, depth).reshape(2 * len(ground), -1)
         jw = j * np.repeat(weight, 2)[:, None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from protocols.geometry import kernels
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
@@ -27,6 +28,13 @@ class ImagePlane:
         self.distorted = lens is not None and (lens.fisheye or bool(np.any(lens.distortions)))
         self.focal = float(0.5 * (self.matrix[0, 0] + self.matrix[1, 1]))
         self._inverse = np.linalg.inv(self.matrix)
+        x, y = self.width - 1.0, self.height - 1.0
+        self.corners: Floats = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]])
+        """Pixels (4, 2), clockwise."""
+        self._valid_radius = np.inf  # of the distortion model, normalised: 1.3 times that of the corners
+        if self.distorted:
+            radius = np.hypot(*self.normalise(self.corners).T)
+            self._valid_radius = 1.3 * float(np.nanmax(radius)) if np.isfinite(radius).any() else 1.0
 
     def normalise(self, pixels: Floats) -> Floats:
         """Normalised coordinates (n, 2) of pixels (n, 2); NaN where the distortion model has no inverse."""
@@ -35,18 +43,39 @@ class ImagePlane:
         m = self._inverse
         return np.asarray(pixels @ m[:2, :2].T + m[:2, 2])
 
-    def pixels(self, normalised: Floats) -> Floats:
-        """Pixels (n, 2); far outside the image, where a distortion model folds over, pinhole projection."""
-        m = self.matrix
-        pinhole = np.asarray(normalised @ m[:2, :2].T + m[:2, 2])
+    @property
+    def compiled(self) -> bool:
+        """Whether the kernels project as this lens does."""
+        return kernels.AVAILABLE and not (self.lens is not None and self.lens.fisheye)
+
+    def kernel_arguments(self, matrix: Floats) -> tuple[Floats, Floats, Floats | None, float, float]:
+        """What the kernels take of a camera with homography ``matrix`` (3, 3), normalised from ground."""
+        coefficients, fold = (None, np.inf) if self.lens is None else (self.lens.distortions, self.lens.fold)
+        return np.ascontiguousarray(matrix), self.matrix, coefficients, fold, self._valid_radius
+
+    def project(self, matrix: Floats, ground: Floats) -> Floats:
+        """Pixels (n, 2) of ground points (n, 2) by a homography (3, 3), normalised from ground; NaN behind the camera.
+
+        Beyond the valid radius the distortion polynomial is not calibrated: there it stays what it is at that radius,
+        which keeps the map continuous.
+        """
+        if self.compiled:
+            out, ground = np.empty((len(ground), 2)), np.ascontiguousarray(ground, dtype=np.float64)
+            kernels.call("ground_pixels", *self.kernel_arguments(matrix), len(out), ground, out)
+            return out
+        normalised = apply_homography(matrix, ground)
+        pinhole = self._pinhole(normalised)
         if not self.distorted or self.lens is None:
             return pinhole
         distorted = self.lens.project_normalised(normalised)
-        # Beyond the corners the distortion polynomial is not calibrated: continue with the pinhole model there.
-        outside = np.hypot(normalised[:, 0], normalised[:, 1]) > self._valid_radius
-        return np.where(
-            np.isfinite(distorted) & ~outside[:, None], distorted, pinhole + self._distortion_at_limit(normalised)
-        )
+        radius = np.maximum(np.hypot(normalised[:, 0], normalised[:, 1]), 1e-9)
+        at = normalised * (self._valid_radius / radius)[:, None]
+        shift = self.lens.project_normalised(at) - self._pinhole(at)
+        valid = np.isfinite(distorted) & (radius <= self._valid_radius)[:, None]
+        return np.where(valid, distorted, pinhole + np.where(np.isfinite(shift), shift, 0.0))
+
+    def _pinhole(self, normalised: Floats) -> Floats:
+        return np.asarray(normalised @ self.matrix[:2, :2].T + self.matrix[:2, 2])
 
     def inside(self, pixels: Floats, margin: float = 0.0) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Which pixels (n, 2) lie in the image, at least ``margin`` from its border."""
@@ -55,29 +84,6 @@ class ImagePlane:
             return np.asarray(
                 (x >= margin) & (y >= margin) & (x <= self.width - 1 - margin) & (y <= self.height - 1 - margin)
             )
-
-    @property
-    def _valid_radius(self) -> float:
-        """Normalised radius up to which the distortion model is used: 1.3 times that of the corners."""
-        cached: float | None = getattr(self, "_valid_radius_value", None)
-        if cached is None:
-            corners = np.array(
-                [[0, 0], [self.width - 1, 0], [0, self.height - 1], [self.width - 1, self.height - 1]], dtype=np.float64
-            )
-            found = self.normalise(corners)
-            radius = np.hypot(found[:, 0], found[:, 1])
-            cached = 1.3 * float(np.nanmax(radius)) if np.isfinite(radius).any() else 1.0
-            self._valid_radius_value = cached
-        return cached
-
-    def _distortion_at_limit(self, normalised: Floats) -> Floats:
-        """The distortion at the valid radius in the same direction, which keeps the map continuous."""
-        assert self.lens is not None
-        radius = np.maximum(np.hypot(normalised[:, 0], normalised[:, 1]), 1e-9)
-        at = normalised * (self._valid_radius / radius)[:, None]
-        m = self.matrix
-        shift = self.lens.project_normalised(at) - (at @ m[:2, :2].T + m[:2, 2])
-        return np.asarray(np.where(np.isfinite(shift), shift, 0.0))
 
 
 def inverse(matrix: Floats) -> Floats:

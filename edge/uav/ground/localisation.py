@@ -10,7 +10,7 @@ from edge.uav.ground.ego_motion import EgoMotion
 from edge.uav.ground.frame_init import GroundFrame, frame_from_image, frame_from_telemetry
 from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
 from edge.uav.ground.photometric import PhotometricGain
-from edge.uav.ground.plane_pose import PlanePose
+from edge.uav.ground.plane_pose import PlaneHomography, PlanePose
 from edge.uav.timing.telemetry_track import TelemetryTrack
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
@@ -34,6 +34,7 @@ class CameraLocaliser:
         self._kind = "image"
         self.target_height = 0.0
         """Height of the target's centre above the ground [ground units]."""
+        self._raised: tuple[PlanePose | PlaneHomography, float, Floats] | None = None  # pose, height, target_matrix
         self._attitude_checked = False
         self._frame = 0
 
@@ -47,10 +48,13 @@ class CameraLocaliser:
 
         Seen obliquely, a roof appears farther away than the ground below it, which would bias the target's speed.
         """
-        pose = self._ego.pose
-        if isinstance(pose, PlanePose) and self.target_height > 0.0:
-            pose = PlanePose(pose.rotation, pose.centre + np.array([0.0, 0.0, self.target_height]))
-        return pose.matrix
+        pose, height = self._ego.pose, self.target_height
+        if self._raised is None or self._raised[0] is not pose or self._raised[1] != height:
+            matrix = pose.matrix.copy()
+            if isinstance(pose, PlanePose):
+                matrix[:, 2] -= height * pose.rotation[:, 2]
+            self._raised = pose, height, matrix
+        return self._raised[2]
 
     @property
     def metric(self) -> bool:
@@ -92,11 +96,11 @@ class CameraLocaliser:
 
     def pixels(self, ground: Floats) -> Floats:
         """Image pixels (n, 2) of ground points (n, 2); NaN behind the camera."""
-        return self.plane.pixels(apply_homography(self.matrix, ground))
+        return self.plane.project(self.matrix, ground)
 
     def target_pixels(self, ground: Floats) -> Floats:
         """As ``pixels``, for targets that stand on these ground points (n, 2)."""
-        return self.plane.pixels(apply_homography(self.target_matrix, ground))
+        return self.plane.project(self.target_matrix, ground)
 
     def target_ground(self, pixels: Floats) -> Floats:
         """Ground points (n, 2) below targets seen at image pixels (n, 2); NaN above the horizon."""

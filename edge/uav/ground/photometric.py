@@ -5,6 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from protocols.geometry import kernels
+from protocols.geometry.order_statistics import median
 from protocols.geometry.types import Floats, Image
 
 _MAX_LOG_CHANGE = 0.3  # of the gain, per frame
@@ -30,28 +32,32 @@ class PhotometricGain:
 
     def update(self, working: Image, old: Floats, new: Floats) -> None:
         """Compare the same ground points in the last working image (``old``, (n, 2)) and in this one (``new``)."""
-        blurred = np.asarray(cv2.blur(working, (5, 5)), np.uint8)
         if self._previous is not None and len(old) >= _MIN_POINTS:
-            before, after = _bilinear(self._previous, old), _bilinear(blurred, new)
+            before, after = _blurred_colours(self._previous, old), _blurred_colours(working, new)
             usable = ((before > 8) & (after > 8) & (before < 247) & (after < 247)).all(axis=1)
             if int(usable.sum()) >= _MIN_POINTS:
-                change = np.median(np.log(after[usable] / before[usable]), axis=0)
+                change = np.array([median(channel) for channel in np.log(after[usable] / before[usable]).T])
                 change = np.clip(change, -_MAX_LOG_CHANGE, _MAX_LOG_CHANGE)
                 # The colour models adapt meanwhile, and rounding errors must not accumulate: hence the leak.
                 self.gain = np.clip(np.exp(_LEAK * np.log(self.gain) + change), *_GAIN_LIMITS)
                 self._lookup_table = None
-        self._previous = blurred
+        self._previous = working.copy()
 
     def corrected(self, image: Image, log_gain: float = 0.0) -> Image:
         """The image (h, w, 3) with the gain removed. log_gain: additional gain to remove, natural logarithm."""
         if abs(log_gain) >= _NEGLIGIBLE_LOG_GAIN:
-            table = _lookup_table(self.gain * np.exp(log_gain))
-            return np.asarray(cv2.LUT(np.ascontiguousarray(image), table), np.uint8)
+            table: Image | None = _lookup_table(self.gain * np.exp(log_gain))
+        else:
+            table = self.table
+        return image if table is None else np.asarray(cv2.LUT(np.ascontiguousarray(image), table), np.uint8)
+
+    @property
+    def table(self) -> Image | None:
+        """Lookup table (1, 256, channels) that removes the gain; None where there is none."""
         if np.abs(self.gain - 1.0).max() < 0.02:
-            return image
-        if self._lookup_table is None:
-            self._lookup_table = _lookup_table(self.gain)
-        return np.asarray(cv2.LUT(np.ascontiguousarray(image), self._lookup_table), np.uint8)
+            return None
+        self._lookup_table = _lookup_table(self.gain) if self._lookup_table is None else self._lookup_table
+        return self._lookup_table
 
 
 class TargetGain:
@@ -101,8 +107,13 @@ def _lookup_table(gain: Floats) -> Image:
     return np.asarray(np.clip(np.rint(levels), 0, 255), np.uint8)[None]
 
 
-def _bilinear(image: Image, points: Floats) -> Floats:
-    """Colours (n, channels) at image points (n, 2), bilinearly interpolated."""
-    at = points.astype(np.float32)
-    found = cv2.remap(image.astype(np.float32), at[:, :1], at[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+def _blurred_colours(image: Image, points: Floats) -> Floats:
+    """Colours (n, channels) at points (n, 2) of an image blurred over 5 x 5 px, bilinearly interpolated."""
+    at, channels = points.astype(np.float32), image.size // (image.shape[0] * image.shape[1])
+    if kernels.AVAILABLE:
+        out = np.empty((len(points), channels))
+        kernels.call("blurred_colours", len(points), at, *image.shape[:2], channels, np.ascontiguousarray(image), out)
+        return out
+    blurred = cv2.blur(image, (5, 5)).astype(np.float32)
+    found = cv2.remap(blurred, at[:, :1], at[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(found, dtype=np.float64).reshape(len(points), -1)

@@ -80,7 +80,7 @@ class PlanePose:
     def prediction_std(self, seconds: float, scale: float) -> Floats:
         """Angular acceleration of a few rad/s², speed changing by 1/20 of the height a frame of 1/30 s."""
         steps = max(seconds * 30.0, 0.3)
-        return np.asarray(steps * np.r_[np.full(3, 0.02), np.full(3, 0.01 * scale)])
+        return steps * np.array(3 * [0.02] + 3 * [0.01 * scale])
 
 
 _GENERATORS = np.array(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from edge.uav.ground import colour_table
 from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
+from protocols.geometry import kernels
 from protocols.geometry.types import Floats, Image, Singles
 
 CELL = 0.5
@@ -17,6 +20,7 @@ _MESH_SPACING = 12  # cells between the points that are projected exactly
 _MAX_DISTANCE = 1e7  # of the view centre from the origin [ground units]
 _BITS = 4  # of a channel: 4,096 colours; finer ones stay empty for long, coarser ones mix road and roofs
 _BINS = 1 << _BITS
+_SMOOTHING = 0.2  # share of a colour's bin that either neighbour gets
 _MAX_LOG_ODDS = 4.0  # eight frames of _MAX_UPDATE: as many unlearn what was wrong
 _MAX_UPDATE = 0.5  # of the log-odds, per frame
 _PRIOR_ROAD_SHARE = 0.3  # share of the image that is road, as a prior
@@ -41,8 +45,7 @@ class RoadMap:
         # Reject outliers: samples on a verge or a marking.
         deviation = np.abs(road - np.median(road, axis=0)).max(axis=1)
         road = road[deviation <= max(2.0 * float(np.median(deviation)), 12.0)]
-        new_road = _smooth_histogram(np.bincount(_bin_index(road), minlength=_BINS**3).astype(np.float64))
-        new_all = _smooth_histogram(np.bincount(_bin_index(image), minlength=_BINS**3).astype(np.float64))
+        new_road, new_all = (colour_table.histogram(part, None, _BITS, _SMOOTHING) for part in (road, image))
         new_road, new_all = new_road / max(new_road.sum(), 1e-9), new_all / max(new_all.sum(), 1e-9)
         if self._log_ratio_table is None or rate >= 1.0:
             self._road_histogram, self._image_histogram = new_road, new_all
@@ -80,10 +83,11 @@ class RoadMap:
         """Whether a colour model has been learnt."""
         return self._log_ratio_table is not None
 
-    def log_likelihood_ratios(self, colours: Image) -> Singles:
-        """Log-likelihood ratio of road for colours (n, 3)."""
+    @property
+    def colour_table(self) -> tuple[int, Singles]:
+        """Bits of a channel, and the log-likelihood ratio (8**bits,) of road of each colour."""
         assert self._log_ratio_table is not None
-        return self._log_ratio_table[_bin_index(colours)]
+        return _BITS, self._log_ratio_table
 
     def update(
         self, working: Image, downscale: int, plane: ImagePlane, matrix: Floats, excluded: Floats | None
@@ -91,26 +95,17 @@ class RoadMap:
         """Add one working image (reduced by ``downscale``). excluded: (m, 2) ground corners of an area left out."""
         if self._log_ratio_table is None:
             return
-        corners = np.array(
-            [[0, 0], [plane.width - 1, 0], [plane.width - 1, plane.height - 1], [0, plane.height - 1]], dtype=np.float64
-        )
-        middle = np.array([[(plane.width - 1) / 2.0, (plane.height - 1) / 2.0]])
         try:
             back = inverse(matrix)
         except np.linalg.LinAlgError:
             return
-        on_ground = apply_homography(back, plane.normalise(np.concatenate([corners, middle])))
-        centre = on_ground[4]
-        if not np.isfinite(centre).all() or np.abs(centre).max() > _MAX_DISTANCE:
+        on_ground = apply_homography(back, plane.normalise(np.vstack([plane.corners, plane.corners.mean(axis=0)])))
+        centre, finite = on_ground[4], np.isfinite(on_ground)
+        if not finite[4].all() or np.abs(centre).max() > _MAX_DISTANCE:
             return
-        spread = np.where(np.isfinite(on_ground[:4]), on_ground[:4], centre + 2 * _UPDATE_REACH)
-        low = np.maximum(
-            np.min(
-                np.vstack([spread, np.where(np.isfinite(on_ground[:4]), on_ground[:4], centre - 2 * _UPDATE_REACH)]), 0
-            ),
-            centre - _UPDATE_REACH,
-        )
-        high = np.minimum(np.max(np.vstack([spread, on_ground[4:]]), 0), centre + _UPDATE_REACH)
+        reach = 2 * _UPDATE_REACH
+        low = np.maximum(np.where(finite, on_ground, centre - reach).min(axis=0), centre - _UPDATE_REACH)
+        high = np.minimum(np.where(finite, on_ground, centre + reach).max(axis=0), centre + _UPDATE_REACH)
         self._recentre(centre)
         first = np.maximum(np.floor((low - self._origin) / CELL).astype(int), 0)
         last = np.minimum(np.ceil((high - self._origin) / CELL).astype(int), _MAP_CELLS)
@@ -121,18 +116,10 @@ class RoadMap:
         nx, ny = (max(2, int(s) // _MESH_SPACING + 1) for s in size)
         gx = np.linspace(0.0, size[0] - 1.0, nx)
         gy = np.linspace(0.0, size[1] - 1.0, ny)
-        mesh = np.stack(np.meshgrid(gx, gy), axis=-1).reshape(-1, 2)
-        pixels = plane.pixels(apply_homography(matrix, (mesh + first + 0.5) * CELL + self._origin))
-        pixels = np.nan_to_num((pixels + 0.5) / downscale - 0.5, nan=-1e4).clip(-1e4, 1e4).reshape(ny, nx, 2)
-        maps = _interpolate_mesh(pixels.astype(np.float32), (int(size[0]), int(size[1])))
-        across, down = cv2.split(maps)
-        warped = cv2.remap(working, across, down, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-        cells = np.asarray(warped, np.uint8)
-        height, width = working.shape[:2]
-        inside = (maps[..., 0] > 1) & (maps[..., 1] > 1) & (maps[..., 0] < width - 2) & (maps[..., 1] < height - 2)
-        increment = np.where(
-            inside, np.clip(self._log_ratio_table[_bin_index(cells)], -1.0, 1.0) * _MAX_UPDATE, 0.0
-        ).astype(np.float32)
+        mesh = np.column_stack([np.tile(gx, ny), np.repeat(gy, nx)])
+        pixels = plane.project(matrix, (mesh + first + 0.5) * CELL + self._origin)
+        pixels = np.fmin(np.fmax((pixels + 0.5) / downscale - 0.5, -1e4), 1e4).reshape(ny, nx, 2)
+        increment = self._evidence(working, pixels, (int(size[0]), int(size[1])))
         if excluded is not None and np.isfinite(excluded).all():
             outline = ((excluded - self._origin) / CELL - first - 0.5).clip(-1e4, 1e4).astype(np.int32)
             cv2.fillConvexPoly(increment, cv2.convexHull(outline[:, None]), 0.0)
@@ -140,10 +127,24 @@ class RoadMap:
         np.clip(part + increment, -_MAX_LOG_ODDS, _MAX_LOG_ODDS, out=part)
         self._smooth = None
 
+    def _evidence(self, working: Image, mesh: Floats, size: tuple[int, int]) -> Singles:
+        """What an image says of a map of this size. mesh: pixels (ny, nx, 2) of cells, linear between them."""
+        assert self._log_ratio_table is not None
+        table = np.clip(self._log_ratio_table, -1.0, 1.0) * np.float32(_MAX_UPDATE)
+        height, width = working.shape[:2]
+        if kernels.AVAILABLE:
+            out, line = np.empty(size[::-1], np.float32), np.empty(2 * mesh.shape[1] + size[0])
+            image = height, width, np.ascontiguousarray(working)
+            kernels.call("road_evidence", *mesh.shape[:2], mesh, *size[::-1], *image, _BITS, table, line, out)
+            return out
+        across, down = cv2.split(_interpolate_mesh(mesh.astype(np.float32), size))
+        cells = cv2.remap(working, across, down, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        inside = (across > 1) & (down > 1) & (across < width - 2) & (down < height - 2)
+        return np.asarray(colour_table.values(table, np.asarray(cells, np.uint8), _BITS) * inside)
+
     def log_odds(self, points: Floats) -> Floats:
         """Log-odds (n,) at ground points (n, 2); 0 where unknown."""
-        index = np.floor((points - self._origin) / CELL)
-        return _lookup(self._log_odds, index)
+        return _lookup(self._log_odds, self._origin, points)
 
     def smooth_around(self, centre: Floats, reach: float) -> None:
         """Smooth the map around a position, for ``smooth_log_odds``."""
@@ -155,11 +156,14 @@ class RoadMap:
         self._smooth = np.asarray(cv2.blur(closed, (3, 3)), np.float32)
         self._smooth_origin = self._origin + first * CELL
 
+    @property
+    def smooth_grid(self) -> tuple[Singles, Floats]:
+        """The smoothed part (h, w), or else the map, and where its first cell begins (2,)."""
+        return (self._log_odds, self._origin) if self._smooth is None else (self._smooth, self._smooth_origin)
+
     def smooth_log_odds(self, points: Floats) -> Floats:
         """Smoothed log-odds (n,) at ground points (n, 2) of the smoothed part; 0 outside it."""
-        if self._smooth is None:
-            return self.log_odds(points)
-        return _lookup(self._smooth, np.floor((points - self._smooth_origin) / CELL))
+        return _lookup(*self.smooth_grid, points)
 
     def road_cells(self, centre: Floats, reach: float) -> Floats:
         """Ground points (n, 2) of cells with high log-odds of road, subsampled, for overlays."""
@@ -193,26 +197,21 @@ def _interpolate_mesh(mesh: Singles, size: tuple[int, int]) -> Singles:
     return np.asarray(cv2.remap(mesh, grid[0], grid[1], cv2.INTER_LINEAR), np.float32)
 
 
-def _lookup(field: Singles, index: Floats) -> Floats:
+def kernel_arguments(field: Singles, origin: Floats) -> tuple[Any, ...]:
+    """What the kernels take of a map (h, w) whose first cell begins at ``origin`` (2,)."""
+    return (*origin.tolist(), CELL, *field.shape, field)
+
+
+def _lookup(field: Singles, origin: Floats, points: Floats) -> Floats:
+    """Values (n,) at ground points (n, 2) of a map (h, w) whose first cell begins at ``origin`` (2,); 0 outside."""
     height, width = field.shape
+    if kernels.AVAILABLE:
+        out, points = np.empty(len(points)), np.ascontiguousarray(points)
+        kernels.call("grid_values", *kernel_arguments(field, origin), len(out), points, out)
+        return out
+    index = np.floor((points - origin) / CELL)
     with np.errstate(invalid="ignore"):
         good = (index[..., 0] >= 0) & (index[..., 1] >= 0) & (index[..., 0] < width) & (index[..., 1] < height)
     x = np.where(good, index[..., 0], 0).astype(np.int64)
     y = np.where(good, index[..., 1], 0).astype(np.int64)
     return np.asarray(np.where(good, field[y, x], 0.0), dtype=np.float64)
-
-
-def _bin_index(colours: Image) -> npt.NDArray[np.int64]:
-    q = colours >> (8 - _BITS)
-    index = (q[..., 0].astype(np.int64) << 2 * _BITS) + (q[..., 1].astype(np.int64) << _BITS) + q[..., 2]
-    return np.asarray(index, dtype=np.int64)
-
-
-def _smooth_histogram(histogram: Floats) -> Floats:
-    cube = histogram.reshape(_BINS, _BINS, _BINS)
-    for axis in range(3):
-        padded = np.pad(cube, [(1, 1) if k == axis else (0, 0) for k in range(3)])
-        before = np.take(padded, range(_BINS), axis)
-        after = np.take(padded, range(2, _BINS + 2), axis)
-        cube = 0.6 * cube + 0.2 * (before + after)
-    return np.asarray(cube.ravel())

@@ -17,6 +17,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from protocols.geometry import kernels
 from protocols.geometry.types import Bools, Floats, Ints
 
 Observation_contra = TypeVar("Observation_contra", contravariant=True)
@@ -182,6 +183,11 @@ def densest_cluster(points: Floats, weights: Floats, radius: float) -> Cluster:
     points: (n, 2); weights: (n,). Mean shift with a flat kernel of that radius, started at the block of three by three
     cells of width radius with the most weight.
     """
+    if kernels.AVAILABLE:
+        inside, found = np.empty(len(points), np.bool_), np.empty(3)
+        given = len(points), np.ascontiguousarray(points), np.ascontiguousarray(weights), radius
+        kernels.call("densest_cluster", *given, np.empty(2 * len(points)), inside, found)
+        return Cluster(found[:2], float(found[2]), inside)
     index = np.floor(points / radius).astype(np.int64)
     cells, inverse = np.unique(_keys(index), return_inverse=True)
     mass = np.bincount(inverse, weights, minlength=len(cells))

@@ -180,13 +180,10 @@ def propagate(
         selected = particles.path == k
         if not selected.any():
             continue
-        limit = np.full(int(selected.sum()), _MAX_SPEED)
-        for distance in _LOOKAHEADS:
-            curvature_ahead = np.maximum(np.abs(path.curvature_at(particles.arc_length[selected] + distance)), 1e-3)
-            limit = np.minimum(
-                limit, np.sqrt(particles.lateral_limit[selected] / curvature_ahead + _braking_allowance(distance))
-            )
-        excess = np.maximum(speed[selected] - limit, 0.0)
+        ahead = path.curvature_at(particles.arc_length[selected] + np.array(_LOOKAHEADS)[:, None])
+        allowances = np.array([_braking_allowance(distance) for distance in _LOOKAHEADS])[:, None]
+        limits = np.sqrt(particles.lateral_limit[selected] / np.maximum(np.abs(ahead), 1e-3) + allowances)
+        excess = np.maximum(speed[selected] - np.minimum(limits.min(axis=0), _MAX_SPEED), 0.0)
         speed[selected] = speed[selected] - np.minimum(excess, 3.5 * dt)
         arc_length[selected] = particles.arc_length[selected] + speed[selected] * dt
         # Beyond the known road each particle has its own sampled curvature.

@@ -11,21 +11,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.ground.road_map import RoadMap
+from edge.uav.ground.road_map import RoadMap, kernel_arguments
+from protocols.geometry import kernels
 from protocols.geometry.types import Floats
 
 STEP = 1.5
 """Distance between the points of a path [ground units]."""
 _LOOKAHEAD = 18.0  # length of a candidate arc
-_MIN_CELL_VALUE = -0.5  # clip of the log-odds: crowns of trees hide road that continues below them
+# Clip of the log-odds, for crowns of trees hide road that continues below them, and value of unknown cells: with less,
+# paths would bend back to known road.
+_CELL_VALUES = (-0.5, 1.5, 1.35)
 _LANE_OFFSETS = (-1.1, 0.0, 1.1)  # lateral, within the car's lane
 _ROAD_OFFSETS, _EDGE_MARGIN = 5, 0.8  # number of lateral offsets across a known road, margin to its edges
 _ROAD_WIDTH_LIMITS = (3.0, 14.0)  # plausible
 _MIN_EDGE_DISTANCE = 1.3  # of a car from an edge
-_UNKNOWN_CELL_VALUE = 1.35  # road has up to 1.5: with less, paths would bend back to known road
 _MAX_CURVATURE = 0.16  # of a candidate arc [1/unit]
 _CURVATURE_DECAY = 14.0  # length constant of the decay on unknown ground
 _EDGE_REACH = 9.0  # to each side [ground units]: half of the widest road, and two more
+_EDGE_STEP = 0.5  # of the search for an edge: a cell of the map
+_OFF_ROAD, _UNSEEN = -0.4, 0.15  # log-odds of what is no road, and size of those of what is hardly known
+_MOST_UNSEEN = 2  # cells that are hardly known before an edge
+_KNOWN = 0.05  # size of log-odds from which a cell counts as observed
+_NEAR_STEPS = 3  # first points of the arcs, without any of which the road ends
 _CURVATURE_HALF_WINDOW = 2  # steps to each side over which curvature is measured
 _SIDE_RADII = (7.0, 11.0)  # of the arc into a side road [ground units]: a tight and a wide turn
 _SIDE_LENGTH = 16.0  # of a side road that must be known
@@ -74,16 +81,21 @@ class RoadPath:
 
 def road_edges(road: RoadMap, points: Floats, headings: Floats) -> tuple[Floats, Floats]:
     """Distances (n,) to the road's edge on the right and on the left, NaN where none is found within reach."""
-    reach = np.arange(0.0, _EDGE_REACH, 0.5)
+    reach = np.arange(0.0, _EDGE_REACH, _EDGE_STEP)
+    if kernels.AVAILABLE:
+        both, given = np.empty((2, len(points))), (np.ascontiguousarray(points), np.ascontiguousarray(headings))
+        limits = len(reach), _EDGE_STEP, _OFF_ROAD, _UNSEEN, _MOST_UNSEEN
+        kernels.call("road_edges", *kernel_arguments(*road.smooth_grid), len(points), *given, *limits, both)
+        return both[0], both[1]
     right = np.column_stack([-np.sin(headings), np.cos(headings)])
     found = []
     for sign in (1.0, -1.0):
         line = points[:, None, :] + sign * reach[None, :, None] * right[:, None, :]
         odds = road.smooth_log_odds(line.reshape(-1, 2)).reshape(len(points), -1)
-        off_road = odds < -0.4
+        off_road = odds < _OFF_ROAD
         first = np.argmax(off_road, axis=1)
         # Not if there are unknown cells before the edge.
-        known = np.cumsum(np.abs(odds) < 0.15, axis=1)[np.arange(len(points)), first] <= 2
+        known = np.cumsum(np.abs(odds) < _UNSEEN, axis=1)[np.arange(len(points)), first] <= _MOST_UNSEEN
         found.append(np.where(off_road.any(axis=1) & known & (first > 0), reach[first], np.nan))
     return found[0], found[1]
 
@@ -136,25 +148,19 @@ def _trace_one(
     offsets = _lateral_offsets(edge_distances)
     lx = forward[:, :, None] - np.sin(angle)[:, :, None] * offsets
     ly = lateral[:, :, None] + np.cos(angle)[:, :, None] * offsets
-    weight = np.linspace(1.3, 0.7, len(arc_length))[None, :, None]
+    weights = np.linspace(1.3, 0.7, len(arc_length))
     points, headings = [start], [heading]
     at, known, past_known = start, 0.0, False
     for _ in range(max(int(np.ceil(length / STEP)), 2)):
-        c, s = np.cos(heading), np.sin(heading)
-        line = np.stack([at[0] + c * lx - s * ly, at[1] + s * lx + c * ly], axis=-1)
-        odds = road.smooth_log_odds(line.reshape(-1, 2)).reshape(lx.shape)
-        observed = np.abs(odds) > 0.05
-        value = np.where(observed, np.clip(odds, _MIN_CELL_VALUE, 1.5), _UNKNOWN_CELL_VALUE)
+        value, observed, near = _look_ahead(road, at, heading, (lx, ly), weights)
         expected = curvature * np.exp(-STEP / _CURVATURE_DECAY)
-        score = (value * weight).mean(axis=(1, 2))
-        score = score - 60.0 * np.square(_CURVATURES - expected) - 14.0 * np.square(_CURVATURES)
-        best = int(np.argmax(score))
-        if not observed[:, :3].any():
+        best = int(np.argmax(value - 60.0 * np.square(_CURVATURES - expected) - 14.0 * np.square(_CURVATURES)))
+        if not near:
             curvature, past_known = expected, True
         else:
             # Near the end of known road only one side is known, which hardly determines the curvature.
             expected_arc = int(np.argmin(np.abs(_CURVATURES - expected)))
-            gain = 0.5 * max(0.0, 2.5 * float(observed[expected_arc].mean()) - 1.5) ** 2
+            gain = 0.5 * max(0.0, 2.5 * float(observed[expected_arc]) - 1.5) ** 2
             curvature += gain * (float(_CURVATURES[best]) - curvature)
         heading = heading + curvature * STEP
         at = at + STEP * np.array([np.cos(heading - 0.5 * curvature * STEP), np.sin(heading - 0.5 * curvature * STEP)])
@@ -166,6 +172,26 @@ def _trace_one(
         points.append(at)
         headings.append(heading)
     return np.array(points), np.array(headings), known
+
+
+def _look_ahead(
+    road: RoadMap, at: Floats, heading: float, arcs: tuple[Floats, Floats], weights: Floats
+) -> tuple[Floats, Floats, bool]:
+    """Mean values (a,) along arcs (a, m, k) ahead and aside of a car, shares (a,) that are observed, and whether any is
+    where they begin. weights: (m,) of the steps.
+    """
+    if kernels.AVAILABLE:
+        out, limits = np.empty(2 * len(arcs[0]) + 1), np.array(_CELL_VALUES)
+        given = *arcs[0].shape, *arcs, weights, *at.tolist(), float(heading), _KNOWN, limits, _NEAR_STEPS, out
+        kernels.call("arc_values", *kernel_arguments(*road.smooth_grid), *given)
+        return out[: len(arcs[0])], out[len(arcs[0]) : -1], bool(out[-1])
+    c, s = np.cos(heading), np.sin(heading)
+    line = np.stack([at[0] + c * arcs[0] - s * arcs[1], at[1] + s * arcs[0] + c * arcs[1]], axis=-1)
+    odds = road.smooth_log_odds(line.reshape(-1, 2)).reshape(arcs[0].shape)
+    observed = np.abs(odds) > _KNOWN
+    value = np.where(observed, np.clip(odds, *_CELL_VALUES[:2]), _CELL_VALUES[2])
+    mean = (value * weights[:, None]).mean(axis=(1, 2))
+    return mean, observed.mean(axis=(1, 2)), bool(observed[:, :_NEAR_STEPS].any())
 
 
 def _lateral_offsets(edge_distances: tuple[float, float]) -> Floats:

@@ -6,18 +6,21 @@ evaluated at every cell of the patch at once; maxima of their mean are the candi
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from edge.uav.correlation.filter import refined
-from edge.uav.ground.image_plane import ImagePlane, apply_homography
+from edge.uav.ground import colour_table
+from edge.uav.ground.image_plane import ImagePlane
 from protocols.geometry.types import Floats, Image, Singles
 
 _BITS = 5  # per colour channel in the table
 _BINS = 1 << _BITS
+_SMOOTHING = 0.25  # share of a colour's bin that either neighbour gets
 _MAX_LOG_RATIO = 2.5  # of a pixel's colour
 _MAX_TARGET_CELLS = 30.0  # the target's length in patch cells
 _MIN_TARGET_CELLS = 12.0  # the same, at least: cells of 0.4 m still tell a car's windows from its roof
@@ -43,10 +46,7 @@ class GroundPatch:
 
     def to_ground(self, cells: Floats) -> Floats:
         """Ground points (n, 2) of cell coordinates (n, 2): x right, y down, 0 = centre of the first cell."""
-        height, width = self.valid.shape
-        local = (cells - [(width - 1) / 2.0, (height - 1) / 2.0]) * self.cell_size
-        c, s = np.cos(self.angle), np.sin(self.angle)
-        return np.asarray(local @ np.array([[c, s], [-s, c]]) + self.centre)
+        return _to_ground(cells, self.valid.shape[::-1], self.centre, self.angle, self.cell_size)
 
     def to_cells(self, ground: Floats) -> Floats:
         """Cell coordinates (n, 2) of ground points (n, 2)."""
@@ -72,6 +72,12 @@ class Candidate:
     angle: float = 0.0
 
 
+def _to_ground(cells: Floats, size: tuple[int, ...], centre: Floats, angle: float, cell_size: float) -> Floats:
+    c, s = math.cos(angle), math.sin(angle)
+    local = (cells - [(size[0] - 1) / 2.0, (size[1] - 1) / 2.0]) * cell_size
+    return np.asarray(local @ np.array([[c, s], [-s, c]]) + centre)
+
+
 def rectify_patch(
     image: Image,
     plane: ImagePlane,
@@ -80,18 +86,17 @@ def rectify_patch(
     angle: float,
     half: tuple[float, float],
     cell_size: float,
+    corrected: Callable[[Image], Image] = lambda cells: cells,
 ) -> GroundPatch | None:
     """Ground patch about ``centre`` (2,), of half sizes ``half`` along and across ``angle``; None if not in view.
 
     matrix: (3, 3) normalised image from ground. cell_size: ground units per cell; increased for a very large patch.
+    corrected: what is done to the cells' colours.
     """
     cell_size = max(cell_size, 2.0 * max(half) / _MAX_PATCH_CELLS)
-    width, height = (2 * int(np.ceil(h / cell_size)) + 1 for h in half)
-    empty = GroundPatch(
-        np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32), centre, angle, cell_size, False
-    )
+    width, height = (2 * math.ceil(h / cell_size) + 1 for h in half)
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
-    pixels = plane.pixels(apply_homography(matrix, empty.to_ground(corners)))
+    pixels = plane.project(matrix, _to_ground(corners, (width, height), centre, angle, cell_size))
     if not np.isfinite(pixels).all() or float(np.abs(pixels).max()) > 1e5:
         return None
     low, high = pixels.min(axis=0), pixels.max(axis=0)
@@ -100,7 +105,7 @@ def rectify_patch(
     image_from_cell = cv2.getPerspectiveTransform(corners.astype(np.float32), pixels.astype(np.float32))
     # With several pixels per cell the image is averaged first, against aliasing.
     area = abs(float(cv2.contourArea(pixels.astype(np.float32)))) / max((width - 1) * (height - 1), 1)
-    coarse = int(np.clip(round(np.sqrt(max(area, 1e-6))), 1, 16))
+    coarse = min(max(round(math.sqrt(area)), 1), 16)
     if coarse > 1:
         x0, y0 = (max(int(v) - 2 * coarse, 0) for v in low)
         x1, y1 = min(int(high[0]) + 2 * coarse, plane.width), min(int(high[1]) + 2 * coarse, plane.height)
@@ -118,16 +123,15 @@ def rectify_patch(
         image_from_cell = shrink @ image_from_cell
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     cells = cv2.warpPerspective(image, image_from_cell, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    complete = bool(plane.inside(pixels, 1.0).all())
+    complete = bool(low.min() >= 1.0 and high[0] <= plane.width - 2 and high[1] <= plane.height - 2)
     if complete:
         valid = np.ones((height, width), np.float32)
     else:
         full = np.ones(image.shape[:2], np.float32)
         visible = cv2.warpPerspective(full, image_from_cell, (width, height), flags=flags)
         valid = (visible > 0.75).astype(np.float32)
-    return GroundPatch(
-        np.asarray(cells, dtype=np.uint8), np.asarray(valid, np.float32), centre, angle, cell_size, complete
-    )
+    cells = corrected(np.asarray(cells, dtype=np.uint8))
+    return GroundPatch(cells, np.asarray(valid, np.float32), centre, angle, cell_size, complete)
 
 
 class AppearanceModel:
@@ -163,6 +167,7 @@ class AppearanceModel:
         self._target_mask = (inside * np.clip(1.6 - r4, 0.0, 1.0)).astype(np.float32)
         ring = np.clip(1.0 - inside - 0.25, 0.0, 1.0)
         self._ring_mask = ring.astype(np.float32)
+        self._shares: dict[tuple[int, ...], tuple[Singles, Singles]] = {}  # in view, of target and ring, by patch size
 
     @property
     def template_half(self) -> tuple[float, float]:
@@ -209,8 +214,6 @@ class AppearanceModel:
         at = patch.to_cells(centre[None])[0]
         template_size = (2 * nx + 1, 2 * ny + 1)
         cells = cv2.getRectSubPix(patch.cells, template_size, (float(at[0]), float(at[1])))
-        index = self._bin_index(patch.cells).ravel()
-        valid: Floats = patch.valid.ravel().astype(np.float64)
         ix, iy = round(float(at[0])) - nx, round(float(at[1])) - ny
         height, width = patch.valid.shape
         target_weight = np.zeros((height, width))
@@ -220,13 +223,13 @@ class AppearanceModel:
         target_weight[y0:y1, x0:x1] = self._target_mask[y0 - iy : y1 - iy, x0 - ix : x1 - ix]
         outside = np.ones((height, width))
         outside[y0:y1, x0:x1] = self._ring_mask[y0 - iy : y1 - iy, x0 - ix : x1 - ix]
-        inside = np.bincount(index, target_weight.ravel() * valid, _BINS**3).astype(np.float64)
-        around = np.bincount(index, outside.ravel() * valid, _BINS**3).astype(np.float64)
-        if inside.sum() <= 0 or around.sum() <= 0:
+        weights = target_weight * patch.valid, outside * patch.valid
+        totals = [float(part.sum()) for part in weights]
+        if min(totals) <= 0.0:
             return
         target_sample, background_sample = (
-            _smooth_histogram(inside / inside.sum()),
-            _smooth_histogram(around / around.sum()),
+            colour_table.histogram(patch.cells, part / total, _BITS, _SMOOTHING)
+            for part, total in zip(weights, totals, strict=True)
         )
         if self._first_histogram is None or rate > 0.5:
             self._first_histogram = self._target_histogram = target_sample
@@ -265,7 +268,7 @@ class AppearanceModel:
 
     def colour_log_ratios(self, cells: Image) -> Singles:
         """Log-likelihood ratio (h, w) of each cell's colour."""
-        return self._log_ratio_table[self._bin_index(cells)]
+        return colour_table.values(self._log_ratio_table, cells, _BITS)
 
     def candidates(self, patch: GroundPatch, limit: int = 6, min_score: float = 0.3) -> list[Candidate]:
         """Local maxima of the score in the patch, the best first."""
@@ -277,8 +280,13 @@ class AppearanceModel:
         ratio = _padded(self.colour_log_ratios(patch.cells) * patch.valid, border)
         valid = _padded(patch.valid, border)
         total, ring_total = float(self._target_mask.sum()), float(self._ring_mask.sum())
-        visible = np.maximum(_correlate(valid, self._target_mask) / total, 0.0)
-        seen_ring = np.maximum(_correlate(valid, self._ring_mask) / ring_total, 0.0)
+        if patch.complete and patch.valid.shape in self._shares:
+            visible, seen_ring = self._shares[patch.valid.shape]
+        else:
+            visible = np.maximum(_correlate(valid, self._target_mask) / total, 0.0)
+            seen_ring = np.maximum(_correlate(valid, self._ring_mask) / ring_total, 0.0)
+            if patch.complete:
+                self._shares[patch.valid.shape] = visible, seen_ring
         inner = _correlate(ratio, self._target_mask) / (total * np.maximum(visible, 0.2))
         outer = _correlate(ratio, self._ring_mask) / (ring_total * np.maximum(seen_ring, 0.2))
         colour = inner - 0.5 * outer
@@ -311,57 +319,45 @@ class AppearanceModel:
 
     def _shape_response(self, patch: GroundPatch, border: tuple[int, int, int, int]) -> Singles:
         """Normalised cross-correlation with the template, maximum over the first and the adapted one."""
+        best = np.zeros(patch.valid.shape, np.float32)
         if self._template is None or self._first_template is None:
-            return np.zeros(patch.valid.shape, np.float32)
+            return best
         grey = np.asarray(cv2.cvtColor(patch.cells, cv2.COLOR_BGR2GRAY), np.float32)
-        templates = (
-            [self._template] if self._first_template is self._template else [self._template, self._first_template]
-        )
         if patch.complete:
             grey = np.asarray(cv2.copyMakeBorder(grey, *border, cv2.BORDER_REPLICATE), np.float32)
-            found = [cv2.matchTemplate(grey, template, cv2.TM_CCOEFF_NORMED) for template in templates]
         else:
-            grey = grey - float(grey.mean())
-            valid = _padded(patch.valid, border)
-            grey = _padded(grey * patch.valid, border)
-            found = [_masked_correlation(grey, valid, template) for template in templates]
-        best = np.asarray(found[0] if len(found) == 1 else np.maximum(found[0], found[1]), np.float32)
-        return np.nan_to_num(best, nan=0.0, posinf=0.0, neginf=0.0)
-
-    def _bin_index(self, cells: Image) -> npt.NDArray[np.int64]:
-        """Bin (h, w) of each cell's colour."""
-        q = (cells >> (8 - _BITS)).astype(np.int32)
-        return np.asarray((q[..., 0] << 2 * _BITS) + (q[..., 1] << _BITS) + q[..., 2], dtype=np.int64)
-
-
-def _smooth_histogram(histogram: Floats) -> Floats:
-    """A histogram over the colour cube, smoothed by about one bin."""
-    cube = histogram.reshape(_BINS, _BINS, _BINS)
-    for axis in range(3):
-        up = np.roll(cube, 1, axis)
-        down = np.roll(cube, -1, axis)
-        first = [slice(None)] * 3
-        last = [slice(None)] * 3
-        first[axis], last[axis] = slice(0, 1), slice(_BINS - 1, _BINS)
-        up[tuple(first)], down[tuple(last)] = 0.0, 0.0
-        cube = 0.5 * cube + 0.25 * (up + down)
-    return np.asarray(cube.ravel())
+            valid, grey = _padded(patch.valid, border), _padded((grey - float(grey.mean())) * patch.valid, border)
+            sums = _visible_sums(grey, valid, self._template.shape)
+        for number, template in enumerate((self._template, self._first_template)):
+            if number and template is self._template:
+                break
+            if patch.complete:
+                found = _correlate(grey, template, cv2.TM_CCOEFF_NORMED)
+            else:
+                found = _masked_correlation(grey, valid, sums, template)
+            best = np.maximum(best, found) if number else found
+        return np.where(np.isfinite(best), best, np.float32(0.0))
 
 
-def _correlate(field: Singles, kernel: Singles) -> Singles:
-    return np.asarray(cv2.matchTemplate(field, kernel, cv2.TM_CCORR), np.float32)
+def _correlate(field: Singles, kernel: Singles, method: int = cv2.TM_CCORR) -> Singles:
+    return np.asarray(cv2.matchTemplate(field, kernel, method), np.float32)
 
 
 def _padded(field: Singles, border: tuple[int, int, int, int]) -> Singles:
     return np.asarray(cv2.copyMakeBorder(field, *border, cv2.BORDER_CONSTANT, value=0.0), np.float32)
 
 
-def _masked_correlation(field: Singles, valid: Singles, template: Singles) -> Singles:
+def _visible_sums(field: Singles, valid: Singles, shape: tuple[int, ...]) -> list[Singles]:
+    """Number of visible cells below a template of this shape, sum and sum of squares of ``field``."""
+    inner = np.s_[shape[0] // 2 : -(shape[0] // 2), shape[1] // 2 : -(shape[1] // 2)]
+    parts = (cv2.boxFilter(one, -1, shape[::-1], normalize=False)[inner] for one in (valid, field, field * field))
+    return [np.asarray(one, np.float32) for one in parts]
+
+
+def _masked_correlation(field: Singles, valid: Singles, sums: list[Singles], template: Singles) -> Singles:
     """Normalised correlation over the visible cells. field: 0 where ``valid`` is 0; same output size as CCORR."""
     centred = template - float(template.mean())
-    ones = np.ones_like(template)
-    n = np.maximum(_correlate(valid, ones), 1.0)
-    image, image2 = _correlate(field, ones), _correlate(field * field, ones)
+    n, image, image2 = np.maximum(sums[0], 1.0), *sums[1:]
     mean, mean2 = _correlate(valid, centred), _correlate(valid, centred * centred)
     cross = _correlate(field, centred) - image * mean / n
     spread = np.maximum(image2 - image * image / n, 0.0) * np.maximum(mean2 - mean * mean / n, 0.0)

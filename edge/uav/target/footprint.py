@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge.uav.ground.image_plane import ImagePlane, apply_homography
+from edge.uav.ground.image_plane import ImagePlane
 from protocols.geometry.types import Floats
 
 _ASPECT = 0.45  # width over length of a car, where the box does not determine it
 _MIN_ASPECT, _MAX_ASPECT = 0.25, 0.8  # of vehicles: beyond, the box is inexact, and a car's ratio is taken
+AROUND = 0.25 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+"""Points [ground units] between which the derivative by ground coordinates is taken."""
 
 
 def pixel_jacobian(plane: ImagePlane, matrix: Floats, position: Floats) -> Floats:
     """Derivative (2, 2) of image pixels by ground coordinates at a ground point (2,), by differences."""
-    step = 0.25
-    points = position + step * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    pixels = plane.pixels(apply_homography(matrix, points))
-    return np.asarray(np.column_stack([pixels[0] - pixels[1], pixels[2] - pixels[3]]) / (2.0 * step))
+    return jacobian_of(plane.project(matrix, position + AROUND))
+
+
+def jacobian_of(pixels: Floats) -> Floats:
+    """The same from the pixels (4, 2) of the points ``AROUND`` it."""
+    return np.asarray((pixels[::2] - pixels[1::2]).T / (2.0 * AROUND[0, 0]))
 
 
 def footprint_from_box(along: float, across: float, turn: float) -> tuple[float, float]:

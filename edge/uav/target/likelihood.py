@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -84,7 +85,7 @@ def evaluate_candidates(
         squared = squared / std**2
         llr_centre = _LLR_CENTRE_REACQUIRE if reacquiring else _LLR_CENTRE
         score = _border_discounted_score(candidate) if reacquiring else candidate.score
-        ratio = np.exp(np.clip(_LLR_SLOPE * (score - llr_centre), _MIN_LLR, _MAX_LLR))
+        ratio = math.exp(min(max(_LLR_SLOPE * (score - llr_centre), _MIN_LLR), _MAX_LLR))
         peak = 0.9 * ratio / (2 * np.pi * std**2) / _CLUTTER_DENSITY
         if reacquiring:
             motion = tracklets[j].velocity()

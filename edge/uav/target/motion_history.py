@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.uav.ground.image_plane import apply_homography
+from protocols.geometry import kernels
 from protocols.geometry.types import Floats
 
 _WINDOW_S = 0.9  # of detections: a longer one averages more, but drivers change their acceleration within a second
@@ -121,7 +122,6 @@ class MotionHistory:
             return None
         positions = np.array(self._positions)[recent]
         stds = np.array(self._stds)[recent]
-        design = np.column_stack([np.ones_like(t), t, 0.5 * t * t])
         # For time-lapse video or units other than metres, acceleration scales with speed.
         mean_speed = float(np.hypot(*(positions[-1] - positions[0]))) / float(t[-1] - t[0])
         acceleration_std = max(_ACCELERATION_STD, _RELATIVE_ACCELERATION_STD * mean_speed)
@@ -134,7 +134,7 @@ class MotionHistory:
             )
             if spread > _VELOCITY_PRIOR_STD:
                 mean, spread = np.zeros(2), _VELOCITY_PRIOR_STD
-        information = np.diag([1e-8, 1.0 / spread**2, 1.0 / acceleration_std**2])
+        information = np.array([1e-8, 1.0 / spread**2, 1.0 / acceleration_std**2])
         prior_right = np.zeros((3, 2))
         prior_right[1] = mean / spread**2
         # Recent detections get more weight: drivers brake and steer within a second.
@@ -148,20 +148,37 @@ class MotionHistory:
             expected = reference.position + ahead * (reference.velocity + 0.5 * ahead * reference.acceleration)
             error = np.linalg.norm(expected - positions, axis=1)
             weight = _robust_weights(stds, error)
-        for _ in range(3):
-            normal = (design * weight[:, None]).T @ design + information
-            solution = np.linalg.solve(normal, (design * weight[:, None]).T @ positions + prior_right)
-            error = np.linalg.norm(design @ solution - positions, axis=1)
-            weight = _robust_weights(stds, error)
+        solution, normal, error = _robust_fit(t, positions, stds, weight, (information, prior_right))
         residual = float(np.sqrt(0.5 * np.mean(np.square(error))))
         inflate = max(1.0, float(np.sqrt(0.5 * np.mean(np.square(error / stds)))))
         covariance = np.linalg.inv(normal) * inflate**2
-        position, velocity, acceleration = solution[:3]
+        position, velocity, acceleration = solution
         of_velocity, of_acceleration = (float(np.sqrt(covariance[k, k])) for k in (1, 2))
         time, count = float(times[-1]), len(t)
         found = MotionFit(time, position, velocity, acceleration, of_velocity, of_acceleration, residual, count)
         self._fits.append(found)
         return found
+
+
+def _robust_fit(
+    t: Floats, positions: Floats, stds: Floats, weight: Floats, prior: tuple[Floats, Floats]
+) -> tuple[Floats, Floats, Floats]:
+    """Position, velocity and acceleration (3, 2) in three steps, their normal matrix (3, 3) and the errors (n,).
+
+    prior: information (3,) and right-hand side (3, 2).
+    """
+    if kernels.AVAILABLE:
+        out = np.empty((3, 2)), np.empty((3, 3)), np.empty(len(t))
+        kernels.call("fit_motion", len(t), t, positions, stds, *prior, weight, *out)
+        return out
+    design = np.column_stack([np.ones_like(t), t, 0.5 * t * t])
+    for _ in range(3):
+        normal = (design * weight[:, None]).T @ design + np.diag(prior[0])
+        right = (design * weight[:, None]).T @ positions + prior[1]
+        solution: Floats = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
+        error: Floats = np.asarray(np.linalg.norm(design @ solution - positions, axis=1))
+        weight = _robust_weights(stds, error)
+    return solution, normal, error
 
 
 def _robust_weights(stds: Floats, error: Floats) -> Floats:

@@ -64,11 +64,14 @@ class Redetector:
         )
         inner = cv2.blur(ratios, (side, side))
         outer = cv2.blur(ratios, (2 * side + 1, 2 * side + 1))
-        response = np.asarray((inner - 0.5 * outer) / target.appearance.colour_scale, np.float32)
-        neighbourhood = np.ones((2 * side + 1, 2 * side + 1), np.uint8)
-        rows, columns = np.nonzero(
-            (response >= cv2.dilate(response, neighbourhood)) & (response > _MIN_COLOUR_RESPONSE)
-        )
+        gain = 1.0 / target.appearance.colour_scale
+        response = np.asarray(cv2.addWeighted(inner, gain, outer, -0.5 * gain, 0.0), np.float32)
+        strong = (response > _MIN_COLOUR_RESPONSE).astype(np.uint8)
+        x, y, width, height = cv2.boundingRect(strong)
+        x, y = max(x - side, 0), max(y - side, 0)  # what is beyond has no influence
+        near = np.s_[y : y + height + 2 * side, x : x + width + 2 * side]
+        strong[near] &= response[near] >= cv2.dilate(response[near], np.ones((2 * side + 1,) * 2, np.uint8))
+        rows, columns = np.nonzero(strong)
         order = np.argsort(response[rows, columns], kind="stable")[::-1][:_MAX_BLOBS]
         at = np.column_stack([columns, rows])[order].astype(np.float64)
         ground = localiser.target_ground((at + 0.5) * localiser.downscale - 0.5)

@@ -37,14 +37,14 @@ def estimate_target(
     heading = pf.circular_mean(particles.heading, weights)
     spread = pf.weighted_covariance(particles.position, particles.weights if missed_frames else weights)
     std_m = float(np.sqrt(0.5 * np.trace(spread)))
-    axes = footprint.pixel_jacobian(localiser.plane, localiser.target_matrix, position)
+    ground = position + footprint.AROUND, position[None], target.outline(position, heading), particles.position
+    pixels = localiser.target_pixels(np.concatenate(ground))
+    axes, centre, corners = footprint.jacobian_of(pixels[:4]), pixels[4], pixels[5:9]
     std = float(np.sqrt(0.5 * np.trace(axes @ spread @ axes.T)))
-    centre = localiser.target_pixels(position[None])[0]
     state = TrackState.COASTING if missed_frames else TrackState.VISIBLE
     uninformative = std_m > LOST_STD * target.length or unseen_s > LOST_AFTER_S
     if missed_frames and (uninformative or not np.isfinite([*centre, std]).all()):
         state = TrackState.LOST
-    corners = localiser.target_pixels(target.outline(position, heading))
     size = corners.max(axis=0) - corners.min(axis=0)
     direction = axes @ np.array([np.cos(heading), np.sin(heading)])
     heading_known = target.aligned and np.isfinite(direction).all()
@@ -58,7 +58,7 @@ def estimate_target(
         heading=float(np.arctan2(direction[1], direction[0])) if heading_known else float("nan"),
         std=std,
         hypotheses=_hypotheses(clusters, localiser),
-        particles=localiser.target_pixels(particles.position),
+        particles=pixels[9:],
     )
     if state is TrackState.LOST:
         return replace(common, x=float("nan"), y=float("nan"), heading=float("nan"), hypotheses=())

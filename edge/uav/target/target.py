@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from functools import partial
 
 import numpy as np
 
@@ -66,9 +67,8 @@ class Target:
         occluded, which shifts the position of the match.
         """
         unoccluded = max(0.05 * self.length, 0.6 / self.scale)
-        occluded = (
-            _OCCLUSION_STD * self.length * float(np.clip(self._typical_score - _OCCLUSION_MARGIN - score, 0.0, 0.5))
-        )
+        missing = min(max(self._typical_score - _OCCLUSION_MARGIN - score, 0.0), 0.5)
+        occluded = _OCCLUSION_STD * self.length * missing
         return unoccluded * (1.0 + 5.0 * max(0.0, 0.97 - visible_share)) + occluded
 
     def is_unoccluded(self, score: float) -> bool:
@@ -85,17 +85,15 @@ class Target:
         localiser, cell = self._localiser, self.appearance.cell_size
         sides = (min(half * self.length, _MAX_HALF_CELLS * cell),) * 2
         angle = self.angle if angle is None else angle
-        patch = rectify_patch(image, localiser.plane, localiser.target_matrix, centre, angle, sides, cell)
-        if patch is None:
-            return None
-        return replace(patch, cells=localiser.photometric.corrected(patch.cells, self.local_gain.log_gain))
+        gain = partial(localiser.photometric.corrected, log_gain=self.local_gain.log_gain)
+        return rectify_patch(image, localiser.plane, localiser.target_matrix, centre, angle, sides, cell, gain)
 
     def update_resolution(self, position: Floats) -> None:
         """Adapt scale and cell size to the resolution at the target's position."""
         axes = footprint.pixel_jacobian(self._localiser.plane, self._localiser.target_matrix, position)
         if not np.isfinite(axes).all():
             return
-        scale = float(np.sqrt(abs(np.linalg.det(axes))))
+        scale = math.sqrt(abs(axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]))
         if scale > 1e-6:
             self.scale = scale
             self.appearance.set_cell_size(1.0 / scale)

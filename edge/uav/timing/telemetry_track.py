@@ -6,6 +6,7 @@ candidate offset; the variance of the difference gives the likelihood of the off
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 
 import numpy as np
@@ -135,10 +136,10 @@ class TelemetryTrack:
     def _bracket(self, telemetry_time: float, extrapolation: float) -> tuple[int, float] | None:
         if len(self._times) < 2:
             return None
-        times = np.array(self._times)
+        times = self._times
         if telemetry_time < times[0] - extrapolation or telemetry_time > times[-1] + extrapolation:
             return None
-        index = int(np.clip(np.searchsorted(times, telemetry_time) - 1, 0, len(times) - 2))
+        index = min(max(bisect_left(times, telemetry_time) - 1, 0), len(times) - 2)
         gap = times[index + 1] - times[index]
         if gap > _MAX_GAP_S:
             return None
@@ -159,7 +160,7 @@ class TelemetryTrack:
         index = np.clip(np.searchsorted(times, camera_times) - 1, 0, len(times) - 2)
         fraction = (camera_times - times[index]) / (times[index + 1] - times[index])
         interpolated = visual[index] + fraction[:, None, None] * (visual[index + 1] - visual[index])
-        m = np.einsum("ij,nkj->nik", rotation, interpolated)
+        m = rotation @ interpolated.transpose(0, 2, 1)
         difference = 0.5 * np.column_stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]])
         # Relative to its recent mean: slow drift of the visual attitude is not caused by a clock offset.
         if self._mean is None:

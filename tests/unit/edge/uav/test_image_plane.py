@@ -52,7 +52,7 @@ def max_pixel_error(ego: EgoMotion, plane: ImagePlane, true: PlanePose, first_gr
     """Largest projection error [px] of the ground points below the corners."""
     matrix = true.matrix if first_ground is None else true.matrix @ first_ground
     ground = apply_homography(inverse(matrix), (CORNERS - LENS.matrix[:2, 2]) / 300.0)
-    return float(np.abs(plane.pixels(apply_homography(ego.pose.matrix, ground)) - CORNERS).max())
+    return float(np.abs(plane.project(ego.pose.matrix, ground) - CORNERS).max())
 
 
 def test_ego_motion_with_known_intrinsics_stays_within_two_pixels_over_two_seconds(
@@ -87,7 +87,7 @@ def test_a_large_image_shift_is_recovered(texture: npt.NDArray[np.uint8]) -> Non
     )  # about 54 px aside, 24 px down
     report = ego.update(render(texture, shifted_pose), 1 / 30, excluded=None)
     assert report.trusted
-    moved = plane.pixels(apply_homography(ego.pose.matrix, plane.normalise(CORNERS)))
+    moved = plane.project(ego.pose.matrix, plane.normalise(CORNERS))
     true = apply_homography(LENS.matrix @ shifted_pose.matrix @ inverse(LENS.matrix @ pose_at_frame(0).matrix), CORNERS)
     assert np.abs(true - CORNERS).max() > 50.0
     np.testing.assert_allclose(moved, true, atol=1.5)
@@ -123,9 +123,9 @@ def test_a_distorted_lens_gives_finite_pixels_far_outside_the_image() -> None:
     lens = Intrinsics(320, 240, LENS.matrix, np.array([-0.3, 0.08, 0.0, 0.0, 0.0]))
     plane = ImagePlane(SIZE, lens)
     inside = np.array([[10.0, 10.0], [300.0, 200.0]])
-    np.testing.assert_allclose(plane.pixels(plane.normalise(inside)), inside, atol=1e-6)
+    np.testing.assert_allclose(plane.project(np.eye(3), plane.normalise(inside)), inside, atol=1e-6)
     line = np.column_stack([np.linspace(0.0, 6.0, 400), np.zeros(400)])
-    out = plane.pixels(line)
+    out = plane.project(np.eye(3), line)
     assert np.isfinite(out).all()
     assert (np.diff(out[:, 0]) > 0).all()
 

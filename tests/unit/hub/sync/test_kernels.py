@@ -7,12 +7,25 @@ import struct
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pytest
 
+from edge.uav.base import Box
 from edge.uav.correlation.features import cell_features
+from edge.uav.ground import colour_table
+from edge.uav.ground.ego_motion import EgoMotion, _solve_pose
+from edge.uav.ground.image_plane import ImagePlane
+from edge.uav.ground.photometric import _blurred_colours
+from edge.uav.ground.plane_pose import PlaneHomography, PlanePose
+from edge.uav.ground.road_map import RoadMap
+from edge.uav.ground_tracker import GroundTracker
+from edge.uav.prediction import paths
+from edge.uav.prediction.particle_filter import densest_cluster
+from edge.uav.target.motion_history import MotionHistory
 from hatch_build import FLAGS
 from hub.bundle.bordered_system import PathBlocks, add_rows
 from hub.bundle.problem import OFFSET, READOUT, CameraState
@@ -32,7 +45,7 @@ from tests.unit.protocols.test_layouts import NASTY_NUMBERS as NASTY
 from tests.unit.protocols.test_layouts import whole
 
 _SOURCE = Path(kernels.__file__).with_name("kernels.c")
-Both = Callable[[Callable[[], Floats]], tuple[Floats, Floats]]
+Both = Callable[[Callable[[], npt.NDArray[Any]]], tuple[npt.NDArray[Any], npt.NDArray[Any]]]
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +63,7 @@ def both(library: Path, monkeypatch: pytest.MonkeyPatch) -> Both:
     """What a function gives by the kernels, and by numpy."""
     monkeypatch.setattr(kernels, "_library", kernels.load(library))
 
-    def run(function: Callable[[], Floats]) -> tuple[Floats, Floats]:
+    def run(function: Callable[[], npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
         found = []
         for available in (True, False):
             monkeypatch.setattr(kernels, "AVAILABLE", available)
@@ -188,6 +201,126 @@ def test_a_pair_has_the_same_solution(both: Both, calibrated: bool) -> None:
         return np.array([fit.offset, fit.rate, fit.residual_px, fit.lag_std, *fit.geometry.matrix.ravel()])
 
     np.testing.assert_allclose(*both(solution), rtol=1e-6)
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_a_camera_over_the_plane_is_fitted_alike(both: Both, calibrated: bool) -> None:
+    rng = np.random.default_rng(11)
+    ground = rng.uniform(-30.0, 30.0, (90, 2))
+    pose = PlanePose(so3.exp(np.array([0.3, -0.2, 1.0])), np.array([2.0, -1.0, -40.0]))
+    at = ground @ pose.matrix[:, :2].T + pose.matrix[:, 2]
+    seen = at[:, :2] / at[:, 2:] + rng.normal(0.0, 1e-3, (90, 2)) + 0.05 * (rng.random((90, 1)) < 0.1)
+    ground[5] = 1e4  # behind the camera, or nearly
+    other = PlanePose(so3.exp(np.array([0.31, -0.19, 1.01])), pose.centre + 0.3)
+    none, attitude = (None, None), ((pose.rotation, np.full(3, 0.02)), (pose.centre, np.full(3, 1.0)))
+
+    def fitted() -> Floats:
+        if calibrated:
+            return _solve_pose(other, ground, seen, 1e-3, other.prediction_std(0.03, 40.0), attitude).matrix
+        guess = PlaneHomography(other.matrix / np.cbrt(np.linalg.det(other.matrix)))
+        return _solve_pose(guess, ground, seen, 1e-3, guess.prediction_std(0.03, 1.0), none).matrix
+
+    np.testing.assert_allclose(*both(fitted), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("bent", [None, [0.0] * 5, [-0.3, 0.12, 1e-3, -5e-4, 0.02], [-0.4, 0.0, 0.0, 0.0, 0.0]])
+def test_the_ground_is_projected_alike(both: Both, bent: list[float] | None) -> None:
+    matrix = np.array([[300.0, 0.0, 319.5], [0.0, 310.0, 239.5], [0.0, 0.0, 1.0]])
+    plane = ImagePlane((640, 480), None if bent is None else Intrinsics(640, 480, matrix, np.array(bent)))
+    pose = PlanePose(so3.exp(np.array([1.2, 0.1, 0.4])), np.array([0.0, 0.0, -30.0]))
+    ground = np.random.default_rng(12).uniform(-400.0, 400.0, (300, 2))
+    ground[7] = np.nan
+    compiled, alone = both(lambda: plane.project(pose.matrix, ground))
+    assert 20 < np.isfinite(alone).all(axis=1).sum() < 280
+    np.testing.assert_allclose(compiled, alone, rtol=1e-11, atol=1e-8)
+
+
+def test_colours_and_maps_are_looked_up_alike(both: Both) -> None:
+    rng = np.random.default_rng(13)
+    image = np.asarray(rng.integers(0, 256, (40, 60, 3)), np.uint8)
+    table, weights = rng.normal(size=16**3).astype(np.float32), rng.random((40, 60))
+    np.testing.assert_array_equal(*both(lambda: colour_table.values(table, image[::2], 4)))
+    np.testing.assert_array_equal(*both(lambda: colour_table.histogram(image, None, 4, 0.2)))
+    np.testing.assert_allclose(*both(lambda: colour_table.histogram(image, weights, 5, 0.25)), rtol=1e-12)
+    road = RoadMap(np.zeros(2))
+    road._log_odds[:] = rng.normal(size=road._log_odds.shape)
+    road._log_ratio_table = table
+    mesh = np.stack(np.meshgrid(np.linspace(-5.0, 64.0, 7), np.linspace(-9.0, 44.0, 5)), -1) + rng.random((5, 7, 2))
+    compiled, alone = both(lambda: road._evidence(image, mesh, (70, 55)))
+    assert np.mean(compiled != alone) < 0.2  # OpenCV interpolates in steps of 1/32: a sixth of a pixel here
+    np.testing.assert_array_equal(*both(lambda: road._evidence(image, mesh, (7, 5))))
+    assert 0.3 < np.mean(alone == 0.0) < 0.6
+    points = np.concatenate([rng.uniform(-300.0, 300.0, (200, 2)), [[np.nan, 0.0], [np.inf, 3.0]]])
+    np.testing.assert_array_equal(*both(lambda: road.log_odds(points)))
+
+
+def test_a_road_is_traced_alike(both: Both) -> None:
+    road, x = RoadMap(np.zeros(2)), np.arange(1024) * 0.5 - 256.0
+    across = np.abs(x[:, None] - 12.0 * np.sin(x / 40.0))  # of a road along the first axis
+    road._log_odds[:] = np.where(across < 4.0, 2.0, -1.5) * (x < 60.0) * (np.abs(x[:, None] - x) < 180.0)
+    road.smooth_around(np.zeros(2), 90.0)
+    points, headings = np.column_stack([x[300:700:7], np.zeros(58)]), np.linspace(-3.0, 3.0, 58)
+    compiled, alone = both(lambda: np.array(paths.road_edges(road, points, headings)))
+    assert 10 < np.isfinite(alone).sum() < 110
+    np.testing.assert_array_equal(compiled, alone)
+    traced = both(lambda: paths.trace_paths(road, np.zeros(2), 0.2, 0.0, 70.0, (4.0, 4.0))[0].points)
+    np.testing.assert_allclose(*traced, rtol=1e-9, atol=1e-9)
+
+
+def test_clusters_are_the_same(both: Both) -> None:
+    rng = np.random.default_rng(17)
+    for spread in (0.1, 3.0, 30.0):
+        points, weights = rng.normal(0.0, spread, (300, 2)), rng.random(300)
+        points[100:] += [40.0, -15.0]
+
+        def found(points: Floats = points, weights: Floats = weights) -> Floats:
+            cluster = densest_cluster(points, weights / weights.sum(), 4.0)
+            return np.array([*cluster.centre, cluster.weight, *cluster.members])
+
+        np.testing.assert_allclose(*both(found), rtol=1e-9)
+
+
+@pytest.mark.parametrize("gain", [1.0, 1.2])
+def test_open_road_is_counted_alike(both: Both, gain: float) -> None:
+    lens = Intrinsics(640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]))
+    tracker, rng = GroundTracker((640, 480), lens), np.random.default_rng(18)
+    tracker.begin(np.asarray(rng.integers(90, 110, (480, 640, 3)), np.uint8), 0.0, Box(300.0, 200.0, 40.0, 20.0))
+    tracker._localiser.photometric.gain = np.full(3, gain)
+    working = np.asarray(rng.integers(40, 160, (240, 320, 3)), np.uint8)
+    tracker._road.learn_colours(working[:60].reshape(-1, 3), working, 1.0)
+    tracker._road._log_ratio_table = rng.normal(size=16**3).astype(np.float32)
+    positions, headings = tracker._target.position + rng.normal(0.0, 20.0, (400, 2)), rng.normal(0.0, 2.0, 400)
+    compiled, alone = both(lambda: tracker._open_road(working, positions, headings))
+    assert set(alone) == {0, 1, 2, 3}
+    np.testing.assert_array_equal(compiled, alone)
+
+
+@pytest.mark.parametrize("size", [(1290, 35), (1723, 22)])
+def test_images_are_reduced_alike(both: Both, size: tuple[int, int]) -> None:
+    image = np.asarray(np.random.default_rng(14).integers(0, 256, (size[1], size[0], 3)), np.uint8)
+    np.testing.assert_array_equal(*both(lambda: EgoMotion(ImagePlane(size, None)).working_image(image)))
+
+
+@pytest.mark.parametrize("shape", [(40, 60, 3), (40, 60), (2, 9, 3)])
+def test_colours_are_blurred_alike(both: Both, shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(15)
+    image = np.asarray(rng.integers(0, 256, shape), np.uint8)
+    points = rng.uniform(-2.0, [shape[1] + 1.0, shape[0] + 1.0], (300, 2))
+    compiled, alone = both(lambda: _blurred_colours(image, points))
+    np.testing.assert_allclose(compiled, alone, atol=1e-3 if min(shape[:2]) > 2 else 80.0)
+
+
+def test_the_motion_of_a_target_is_fitted_alike(both: Both) -> None:
+    def fitted() -> Floats:
+        rng, history = np.random.default_rng(16), MotionHistory()
+        for k in range(24):
+            place = np.array([0.4 * k, 0.01 * k * k]) + rng.normal(0.0, 0.05 if k % 7 else 1.0, 2)
+            history.add(k / 30.0, place, 0.2)
+            found = history.fit()
+        assert found is not None
+        return np.array([*found.position, *found.velocity, *found.acceleration, found.velocity_std, found.residual])
+
+    np.testing.assert_allclose(*both(fitted), rtol=1e-9)
 
 
 def test_without_a_library_there_is_none(tmp_path: Path) -> None:
