@@ -28,8 +28,8 @@ from edge.uav.prediction.particle_filter import densest_cluster
 from edge.uav.target.motion_history import MotionHistory
 from hatch_build import FLAGS
 from hub.bundle.bordered_system import PathBlocks, add_rows
-from hub.bundle.problem import OFFSET, READOUT, CameraState
-from hub.bundle.residuals import SplineSupport, evaluate_points, jacobians
+from hub.bundle.problem import OFFSET, READOUT, CameraState, TrackObservations, Trajectory, UsedRows
+from hub.bundle.residuals import SplineSupport, StackedTrajectories, evaluate_points, jacobians
 from hub.sync.lag_scan import smallest_eigenvalues
 from hub.sync.pair_solver import solve_pair
 from hub.trajectory.image_tracks import neighbour_test, smooth_track
@@ -132,6 +132,28 @@ def test_neighbours_are_judged_alike(both: Both) -> None:
     by_kernels, by_numpy = both(lambda: neighbour_test(time, points, 1e-3))
     assert 0 < by_numpy.sum() < 120
     np.testing.assert_array_equal(by_kernels, by_numpy)
+
+
+def test_rows_of_several_labels_are_on_their_paths_alike(both: Both) -> None:
+    rng = np.random.default_rng(9)
+    bases = [SplineBasis.covering(np.array([0.0, 3.0]), np.array([2.0, 4.0 + k]), 0.3) for k in range(3)]
+    paths = {4 + k: Trajectory(basis, rng.normal(size=(basis.size, 3))) for k, basis in enumerate(bases)}
+    parts = [
+        TrackObservations(0, label, np.sort(rng.uniform(-1.0, 7.0, count)), np.zeros((count, 2)), np.full(count, True))
+        for label, count in ((6, 30), (4, 1), (5, 20))
+    ]
+    rows, stacked = UsedRows.of(parts), StackedTrajectories.of(paths)
+    times = np.where(np.arange(len(rows.time)) == 7, np.nan, rows.time)
+    for part in range(4):
+        by_kernels, by_numpy = both(lambda part=part: np.asarray(stacked.support(rows, times)[part]))  # type: ignore[misc]
+        np.testing.assert_allclose(by_kernels, by_numpy, rtol=1e-12, atol=1e-12)
+    index, weights, _, inside = stacked.support(rows, rows.time)
+    at = slice(31, 51)  # of label 5
+    expected = paths[5].at(rows.time[at])
+    used = inside[at] & np.isfinite(expected[:, 0])
+    assert 5 < used.sum() < 20
+    found = weighted_sums(stacked.control, index, weights)[at]
+    np.testing.assert_allclose(found[used], expected[used], atol=1e-12)
 
 
 @pytest.mark.parametrize("others", [1, 12, 22])
