@@ -68,10 +68,13 @@ _found = None if os.environ.get("SYNCLINE_PURE") else load(Path(__file__).with_n
 AVAILABLE, _library = _found is not None, cast(CDLL, _found)
 
 
+_BYTE = c_char.from_buffer
+
+
 def _at(array: npt.NDArray[Any]) -> int:
     """The address of an array, which is contiguous and outlives the call."""
     try:
-        return addressof(c_char.from_buffer(array))  # type: ignore[arg-type]  # a third of the time of numpy's own
+        return addressof(_BYTE(array))  # type: ignore[arg-type]  # a third of the time of numpy's own
     except (TypeError, ValueError):  # read-only or empty
         assert array.flags.c_contiguous, "a kernel would read beside the array"
         return array.ctypes.data
@@ -79,7 +82,10 @@ def _at(array: npt.NDArray[Any]) -> int:
 
 def call(name: str, *given: npt.NDArray[Any] | float | None) -> float:
     """Call a function of kernels.c with numbers and arrays, which are contiguous and of its types; None is null."""
-    arguments = [one if one is None or isinstance(one, int | float) else _at(one) for one in given]
+    try:  # in place of _at: half of a call's time
+        arguments = [addressof(_BYTE(one)) if type(one) is np.ndarray else one for one in given]  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        arguments = [_at(one) if isinstance(one, np.ndarray) else one for one in given]
     return cast(float, getattr(_library, name)(*arguments))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import null_space
 
-from hub.bundle.adjustment import adjust, apply_step, gauge
+from hub.bundle.adjustment import adjust, apply_step, gauge, minimise
 from hub.bundle.block_matrix import BlockSum, SparseCovariance
 from hub.bundle.bordered_system import BAND, BorderedSystem, PathByCameras, border_block, eliminate, solve
 from hub.bundle.covariance import constrained_step, inverse_blocks
@@ -33,9 +33,10 @@ from hub.bundle.problem import (
     Trajectory,
 )
 from hub.bundle.residuals import linearise, residual_norms
-from hub.bundle.smoothness_prior import SmoothnessPrior
+from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
+from protocols.session.calibration import AdjustmentStep
 from tests.support.rigs import random_lens, random_path, random_poses
 
 
@@ -466,3 +467,13 @@ def test_the_covariance_of_cameras_that_overlap_few_others_equals_the_dense_one(
         np.testing.assert_allclose(sparse.submatrix(columns), dense_one.submatrix(columns), **limits)
     block = rng.normal(size=(normal.size, 3))
     np.testing.assert_allclose(sparse @ block, dense_one @ block, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
+
+
+def test_steps_that_go_too_far_are_cut_to_the_parabola_s_minimum() -> None:
+    """A strong prior, whose metric follows the path: 53 steps without."""
+    problem, state, _ = simulated_problem(3, lens=False, perturbation=1e-3)
+    prior = estimate_smoothness(problem, state)
+    prior = replace(prior, weights=tuple(3000.0 * one for one in prior.weights))
+    steps: list[AdjustmentStep] = []
+    minimise(problem, state, prior, False, 100, 1e-9, steps, False)
+    assert len(steps) < 30
