@@ -281,6 +281,33 @@ def test_attitudes_that_turn_otherwise_than_the_video_are_named(
     assert (named or "") in printed.out + printed.err
 
 
+@pytest.mark.parametrize(
+    ("written", "named"),
+    [
+        (lambda p: [47.39 + p[0] / 111_320.0, 8.54 + p[1] / 75_000.0, p[2]], "not latitude and longitude"),
+        (lambda p: [0.0, 0.0, p[2]], "its positions move by 0 m in a second"),
+        (lambda p: [p[0], p[1], p[2] - 40.0], "not from sea level"),
+    ],
+)
+def test_positions_that_are_no_metres_above_the_ground_are_named(
+    flight: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    written: Callable[[Floats], list[float]],
+    named: str,
+) -> None:
+    """They were believed: the target stood still with stds of 0.1 m, or was 28 m off."""
+    lines = (flight / "telemetry.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    changed = [",".join([*row[:5], *map(str, written(np.array(row[5:8], float)))]) for row in rows]
+    (tmp_path / "t.csv").write_text("\n".join([lines[0], *changed]) + "\n")
+    arguments = ["track", str(flight / "video.mp4"), "--target", TARGET, "--rig", str(flight / "rig.toml")]
+    status = run([*arguments, "--telemetry", str(tmp_path / "t.csv"), "--out", str(tmp_path / "out")])
+    printed = capsys.readouterr()
+    assert status == (0 if "sea level" in named else 2)
+    assert named in printed.out + printed.err
+
+
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_a_variable_frame_rate_is_no_loss_of_frames(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], share: float
