@@ -79,7 +79,15 @@ class LocalFrame:
             self.origin = replace(self.origin, altitude=home)
         position = self.origin.to_ned(report.latitude, report.longitude, report.altitude)
         if local is None:
-            self.position = time, position, report.velocity
+            velocity = report.velocity
+            if (
+                not velocity.any()
+                and self.position is not None
+                and 0.0 < time - self.position[0] < 2 * MAX_POSITION_AGE_S
+            ):
+                # Betaflight sends 0 in place of it.
+                velocity = (position - self.position[1]) / (time - self.position[0])
+            self.position = time, position, velocity
         else:
             self._correct(position - local[0], 0.0)
 

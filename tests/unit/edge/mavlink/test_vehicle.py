@@ -254,6 +254,18 @@ def test_positions_count_from_home_height_in_one_frame_whatever_the_local_frame_
         assert place_m == pytest.approx([10.0 * time_s, 0.0, -20.0], abs=0.3)
 
 
+def test_a_velocity_that_is_not_sent_is_that_of_the_positions() -> None:
+    """Betaflight's positions come once or twice a second, with velocity 0."""
+    one, home = VehicleUnderTest(), Origin(47.3977, 8.5456, 488.0)
+    for time_s in (0.0, 1.0, 2.0):
+        latitude, longitude, _ = home.to_geodetic(10.0 * time_s, 0.0, 0.0)
+        place = round(1e7 * latitude), round(1e7 * longitude), 538_000, 50_000
+        one.take(mavlink.MAVLink_global_position_int_message(boot_ms(time_s), *place, 0, 0, 0, 0), time_s)
+    motion = one.vehicle.motion_at(2.9)
+    assert motion is not None
+    assert motion[0] == pytest.approx([29.0, 0.0, -50.0], abs=0.1)
+
+
 def test_a_gimbal_that_never_reports_is_named() -> None:
     under_test = VehicleUnderTest(gimbal=True)
     for k in range(40):
