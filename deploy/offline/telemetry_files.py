@@ -95,21 +95,23 @@ def read_telemetry_log(file: Path) -> TelemetryFile:
 
 def align_to_video(
     recorded: TelemetryFile,
+    file: Path,
     video: Path,
     fps: float | None,
     lens: Intrinsics,
     body_from_camera: Floats,
     progress: Callable[[int], None] | None = None,
-) -> tuple[tuple[Telemetry, ...], str]:
-    """The samples on the video's clock, 0 = its first frame, and a message for the user.
+) -> tuple[tuple[Telemetry, ...], list[str]]:
+    """The samples on the video's clock, 0 = its first frame, and warnings for the user.
 
-    No samples if the offset can't be estimated; the message gives the reason. progress: called with each frame's index.
+    No samples if the offset can't be estimated; a warning gives the reason. progress: called with each frame's index.
+    Raises InputError where the positions are wrong.
     """
     samples = recorded.samples
     (rotations,), time = _visual_rotations(video, fps, lens, [(samples, body_from_camera)], progress)
     offset = find_offset(rotations, samples, body_from_camera)
     if isinstance(offset, str):
-        return (), f"the telemetry is not used, its clock offset against the video's is not observable: {offset}"
+        return (), [f"the telemetry is not used, its clock offset against the video's is not observable: {offset}"]
     # Where the video is longer than the frames used for alignment, all later samples are kept.
     end = offset.offset + time + _MARGIN_S
     shifted = tuple(
@@ -117,8 +119,7 @@ def align_to_video(
         for sample in samples
         if offset.offset - _MARGIN_S <= sample.time <= end
     )
-    text = f"telemetry's clock reads {offset.offset:.3f} s (+-{1e3 * offset.std:.0f} ms) at the first frame"
-    return shifted, text
+    return shifted, _check_motion(offset.motion, file)
 
 
 def check_attitudes(
@@ -175,9 +176,9 @@ def _check_motion(motion: GroundMotion | None, file: Path) -> list[str]:
         raise InputError(f"its {motion.contradiction}", file=file, remedy="correct --rig or the telemetry")
     if motion.stands_still:
         what = f"its positions move by {motion.reported:.2g} m in a second, but the video by {motion.seen:.0f} m"
-        remedy = "give north,east,down in metres, not latitude and longitude, or leave these columns out"
+        remedy = "give north,east,down in metres, not latitude and longitude, or leave positions out"
         raise InputError(what, file=file, remedy=remedy)
-    remedy = "give down from the ground's height, not from sea level, and all three in metres"
+    remedy = "give positions in metres, with heights above the ground and not above sea level"
     return [f"{file}: {motion.wrong_height}: {remedy}"] if motion.wrong_height else []
 
 
