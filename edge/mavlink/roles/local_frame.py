@@ -79,14 +79,9 @@ class LocalFrame:
             self.origin = replace(self.origin, altitude=home)
         position = self.origin.to_ned(report.latitude, report.longitude, report.altitude)
         if local is None:
-            velocity = report.velocity
-            if (
-                not velocity.any()
-                and self.position is not None
-                and 0.0 < time - self.position[0] < 2 * MAX_POSITION_AGE_S
-            ):
-                # Betaflight sends 0 in place of it.
-                velocity = (position - self.position[1]) / (time - self.position[0])
+            last, velocity = self.position, report.velocity
+            if last is not None and not velocity.any() and 0.0 < time - last[0] < 2 * MAX_POSITION_AGE_S:
+                velocity = (position - last[1]) / (time - last[0])  # Betaflight sends 0 in place of it
             self.position = time, position, velocity
         else:
             self._correct(position - local[0], 0.0)

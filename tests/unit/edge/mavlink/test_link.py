@@ -131,6 +131,7 @@ def test_a_gimbals_attitude_counts_where_rates_are_not_available() -> None:
         (random.Random(1).randbytes(2000), "check the baud rate"),
         (Sender(Pipe(), component=190).pack(heartbeat(autopilot=8)), "messages arrive, but no autopilot's heartbeat"),
     ],
+    ids=["garbage", "a station"],
 )
 def test_what_arrives_in_place_of_the_vehicle_is_named(sent: bytes, problem: str) -> None:
     link, pipe = make_link()
