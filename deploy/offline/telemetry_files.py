@@ -12,9 +12,9 @@ import numpy as np
 from deploy.offline.track import TelemetryFile
 from deploy.offline.track_log import open_recording
 from edge.uav.base import Telemetry
+from edge.uav.timing.ground_motion import GroundMotion, RelativeRotations, compare_ways
 from edge.uav.timing.telemetry_offset import (
     OffsetSearch,
-    RelativeRotations,
     find_offset,
     search_offset,
     turned_about_axis,
@@ -95,21 +95,23 @@ def read_telemetry_log(file: Path) -> TelemetryFile:
 
 def align_to_video(
     recorded: TelemetryFile,
+    file: Path,
     video: Path,
     fps: float | None,
     lens: Intrinsics,
     body_from_camera: Floats,
     progress: Callable[[int], None] | None = None,
-) -> tuple[tuple[Telemetry, ...], str]:
-    """The samples on the video's clock, 0 = its first frame, and a message for the user.
+) -> tuple[tuple[Telemetry, ...], list[str]]:
+    """The samples on the video's clock, 0 = its first frame, and warnings for the user.
 
-    No samples if the offset can't be estimated; the message gives the reason. progress: called with each frame's index.
+    No samples if the offset can't be estimated; a warning gives the reason. progress: called with each frame's index.
+    Raises InputError where the positions are wrong.
     """
     samples = recorded.samples
     (rotations,), time = _visual_rotations(video, fps, lens, [(samples, body_from_camera)], progress)
     offset = find_offset(rotations, samples, body_from_camera)
     if isinstance(offset, str):
-        return (), f"the telemetry is not used, its clock offset against the video's is not observable: {offset}"
+        return (), [f"the telemetry is not used, its clock offset against the video's is not observable: {offset}"]
     # Where the video is longer than the frames used for alignment, all later samples are kept.
     end = offset.offset + time + _MARGIN_S
     shifted = tuple(
@@ -117,8 +119,7 @@ def align_to_video(
         for sample in samples
         if offset.offset - _MARGIN_S <= sample.time <= end
     )
-    text = f"telemetry's clock reads {offset.offset:.3f} s (+-{1e3 * offset.std:.0f} ms) at the first frame"
-    return shifted, text
+    return shifted, _check_motion(offset.motion, file)
 
 
 def check_attitudes(
@@ -136,20 +137,25 @@ def check_attitudes(
     """
     from edge.uav.timing.telemetry_track import MAX_OFFSET_S
 
-    def search(readings: list[_Reading]) -> list[OffsetSearch | None]:
+    def search(readings: list[_Reading]) -> list[tuple[OffsetSearch | None, GroundMotion | None]]:
         rotations, _ = _visual_rotations(video, fps, lens, readings, progress)
         limits = -MAX_OFFSET_S, MAX_OFFSET_S
-        found = [search_offset(seen, *reading, limits) for seen, reading in zip(rotations, readings, strict=True)]
-        return [None if isinstance(one, str) else one for one in found]
+        out: list[tuple[OffsetSearch | None, GroundMotion | None]] = []
+        for seen, reading in zip(rotations, readings, strict=True):
+            found = search_offset(seen, *reading, limits)
+            searched = None if isinstance(found, str) else found
+            offset = 0.0 if searched is None or searched.evidence < searched.threshold else searched.offset
+            out.append((searched, compare_ways(seen, *reading, offset)))
+        return out
 
-    given = search([(recorded.samples, body_from_camera)])[0]  # none where its camera looks at the sky
+    given, motion = search([(recorded.samples, body_from_camera)])[0]  # none where its camera looks at the sky
     if given is not None and given.evidence >= given.threshold:
-        return []
+        return _check_motion(motion, file)
     least = 0.0 if given is None else given.evidence
     others = search([read(recorded.samples, body_from_camera) for read in _CONVENTIONS.values()])
     fits = {
         one.evidence: name
-        for name, one in zip(_CONVENTIONS, others, strict=True)
+        for name, (one, _) in zip(_CONVENTIONS, others, strict=True)
         if one is not None and one.evidence > least + one.threshold
     }
     if fits:
@@ -157,9 +163,23 @@ def check_attitudes(
         remedy = "give qw,qx,qy,qz of ned_from_body and body_from_camera; body axes are forward, right, down"
         raise InputError(what, file=file, remedy=remedy)
     if given is None or not given.contradicts:
-        return []
+        return _check_motion(motion, file)
     turn = f"its attitudes turn by {math.degrees(given.telemetry_rms):.1f} degrees rms, but not as the video does"
     return [f"{file}: {turn}: check body_from_camera in --rig, and that both are of one flight and on one clock"]
+
+
+def _check_motion(motion: GroundMotion | None, file: Path) -> list[str]:
+    """A warning where positions are at another height than the video shows. Raises InputError where they are wrong."""
+    if motion is None:
+        return []
+    if motion.contradiction:
+        raise InputError(f"its {motion.contradiction}", file=file, remedy="correct --rig or the telemetry")
+    if motion.stands_still:
+        what = f"its positions move by {motion.reported:.2g} m in a second, but the video by {motion.seen:.0f} m"
+        remedy = "give north,east,down in metres, not latitude and longitude, or leave positions out"
+        raise InputError(what, file=file, remedy=remedy)
+    remedy = "give positions in metres, with heights above the ground and not above sea level"
+    return [f"{file}: {motion.wrong_height}: {remedy}"] if motion.wrong_height else []
 
 
 def _visual_rotations(

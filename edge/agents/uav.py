@@ -212,7 +212,8 @@ class UavAgent:
             message += f": {reason}" if reason else ""
         elif not ended:
             contradiction = self.aligner.reason if self.aligner is not None and self._contradicted else ""
-            problem = vehicle.problem(self._now_ns()) or contradiction or reason
+            height = "" if self.aligner is None else self.aligner.wrong_height
+            problem = vehicle.problem(self._now_ns()) or contradiction or reason or height
             state = "degraded" if contradiction or problem.startswith("no attitude") else state
             message = problem or self._guidance.hold_reason or "commands are sent"
         counters: Counter[str] = Counter(self.counters)

@@ -30,6 +30,26 @@ def test_calibrate_imports_no_slow_module() -> None:
         assert slow not in modules
 
 
+def test_the_first_alignment_in_flight_imports_nothing() -> None:
+    """It held up the images for 2 s, 6 s after the start."""
+    code = (
+        "import sys, numpy as np; from edge.uav.timing import clock_alignment, telemetry_offset as t;"
+        "from edge.uav.base import Telemetry; from protocols.geometry import so3;"
+        "from protocols.geometry.camera import Intrinsics;"
+        "clock_alignment.ClockAligner((640, 480), Intrinsics(640, 480, np.eye(3)), np.eye(3));"
+        "before = set(sys.modules);"
+        "at = np.arange(0.0, 12.0, 1 / 30); turn = np.outer(np.sin(at * at / 4), np.ones(3)) / 9; r = so3.exp(turn);"
+        "seen = [so3.log(b.T @ a) for a, b in zip(r, r[1:])]; every = slice(None, None, 4);"
+        "given = [Telemetry(float(x), y) for x, y in zip(at[every], r[every])];"
+        "print(t.find_offset(t.RelativeRotations(at[:-1], at[1:], np.array(seen)), given, np.eye(3), (-0.5, 0.5)).std);"
+        "print(*set(sys.modules) - before)"
+    )
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    std, modules = process.stdout.splitlines()
+    assert float(std) < 0.02
+    assert not [name for name in modules.split() if name.startswith("scipy")]
+
+
 def test_calibrate_does_not_load_what_scipy_imports_in_vain() -> None:
     code = (
         "import sys; from deploy.commands.offline.calibrate import UNUSED_OF_NUMPY as unused, defer_modules;"

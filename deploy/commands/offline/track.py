@@ -221,9 +221,9 @@ def _samples(
         samples = ()
     else:
         with _watched("looking for the telemetry's clock in", flight, quiet) as done:
-            samples, line = align_to_video(recorded, flight.video, flight.rate, flight.lens, flight.mounting, done)
-        if not samples:
-            warnings.append(line)
+            given = flight.video, flight.rate, flight.lens, flight.mounting
+            samples, found = align_to_video(recorded, telemetry, *given, done)
+        warnings += found
     return samples, warnings
 
 

@@ -95,15 +95,16 @@ def wait_for_heartbeat(
         return unavailable("mavlink", str(link.problem), "stop the agent (or whoever holds that port) and ask again")
     if "key" in link.problem or "sign" in link.problem:
         return unavailable("mavlink", str(link.problem), "the same key in both, and a clock that is set (GPS, NTP)")
-    if link.problem:
+    arrive = "arrive" in link.problem
+    if link.problem and not arrive:
         return unavailable(
             "mavlink", str(link.problem), "check device, baud rate and rights (group dialout), or the address"
         )
     refused = sum(count for name, count in link.counters.items() if name not in ("received", "bytes", "opened", "sent"))
-    if refused:
+    if refused or arrive:
         return unavailable(
             "mavlink",
-            f"bytes arrive, but no acceptable heartbeat ({dict(link.counters)})",
+            f"{link.problem or 'bytes arrive, but no acceptable heartbeat'} ({dict(link.counters)})",
             "check the baud rate, MAVLink 2 (SERIALx_PROTOCOL = 2), and the signing key",
         )
     return unavailable(

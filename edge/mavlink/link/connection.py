@@ -23,12 +23,17 @@ _DEFAULT_SYSTEM = 1  # the first vehicle of a network
 _MAX_SENDERS = 8  # senders whose bytes are parsed while no vehicle is locked
 _SILENT_NS = 1_500_000_000  # of an autopilot, which sends a heartbeat each second and here 30 attitudes
 _UNKNOWN_SILENT_NS = 10 * NANOSECONDS  # … of one of which only heartbeats are known, before another host is followed
+_TCP_SILENT_NS = 10 * NANOSECONDS  # ten heartbeats, after which a connection whose other side is gone is made anew
+_LEAST_GARBLED = 1000  # bytes without a message, a second of a slow port: not the start of one in the middle
 _MIN_RETRY_S, _MAX_RETRY_S = 0.2, 1.0  # doubled up to, until the device or address is there
 _CONFLICT_SHOWN_NS = 10 * NANOSECONDS
+_GARBLED = "bytes arrive, but no MAVLink messages: check the baud rate, and what the port speaks"
 _NAN_ALLOWED = frozenset({"COMMAND_LONG", "COMMAND_INT", "GIMBAL_MANAGER_SET_PITCHYAW", "CAMERA_TRACKING_IMAGE_STATUS",
                           "CAMERA_TRACKING_GEO_STATUS", "CAMERA_FOV_STATUS", "VIDEO_STREAM_INFORMATION",
                           "CAMERA_INFORMATION"})  # fmt: skip
 """Message types in which NaN means "not available"; their readers check each field."""
+_USED = {"GIMBAL_DEVICE_ATTITUDE_STATUS": ("q",), "ATTITUDE_QUATERNION": ("q1", "q2", "q3", "q4")}
+"""The fields that are read of messages in whose others NaN means "not available"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +90,7 @@ class Link:
         self._framers: dict[Address, Framer] = {}
         self._retry_s = _MIN_RETRY_S
         self._next_try_ns = 0
+        self._bytes_ns = 0
         self._address: Address | None = None
         self._reply_address: Address | None = None
         self._fixed = vehicle is not None
@@ -129,6 +135,12 @@ class Link:
                 self._handle_failure(error)
                 return []
             now = self._now_ns()
+            if pieces:
+                self._bytes_ns = now
+            elif self._url is not None and self._url.kind == "tcp" and now - self._bytes_ns > _TCP_SILENT_NS:
+                # A peer that was switched off closes nothing, and the kernel waits for it for a quarter of an hour.
+                self._handle_failure(TimeoutError(f"nothing received for {_TCP_SILENT_NS // NANOSECONDS} s"))
+                return []
             out: list[ReceivedMessage] = []
             for data, address in pieces:
                 out += self._process(data, address, now)
@@ -195,13 +207,16 @@ class Link:
                 self._framers.pop(next(key for key in self._framers if key != self._address))
             framer = self._framers[address] = Framer()
         garbage, unknown = framer.unreadable, framer.unknown
-        out = []
+        out, readable = [], False
         for message, frame in framer.feed(data, whole=self._datagrams):
+            readable = True
             received = self._accept(message, frame, address, now)
             if received is not None:
                 out.append(received)
         self.counters["garbled_bytes"] += framer.unreadable - garbage
         self.counters["unknown"] += framer.unknown - unknown
+        if self.vehicle is None and self._signing is None and (readable or framer.unreadable > _LEAST_GARBLED):
+            self.problem = "messages arrive, but no autopilot's heartbeat" if readable else _GARBLED
         return out
 
     def _accept(self, message: Any, frame: bytes, address: Address, now: int) -> ReceivedMessage | None:
@@ -315,7 +330,7 @@ class Link:
             if self._url is None:  # closed meanwhile
                 transport.close()
                 return
-            self._transport = transport
+            self._transport, self._bytes_ns = transport, self._now_ns()
             self.counters["opened"] += 1
             self._retry_s, self.problem = _MIN_RETRY_S, ""
 
@@ -339,7 +354,7 @@ def is_autopilot(message: Any, component: int) -> bool:
 
 
 def _all_finite(message: Any) -> bool:
-    for name in message.get_fieldnames():
+    for name in _USED.get(message.get_type(), message.get_fieldnames()):
         value = getattr(message, name)
         values = value if isinstance(value, list) else (value,)
         if any(isinstance(part, float) and not math.isfinite(part) for part in values):

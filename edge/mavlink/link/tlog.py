@@ -16,9 +16,9 @@ import numpy as np
 from edge.mavlink.dialect import AUTOPILOT, mavlink
 from edge.mavlink.link.connection import is_autopilot
 from edge.mavlink.link.framing import V1, V2, frame_length
+from edge.mavlink.roles.local_frame import LocalFrame
 from edge.mavlink.roles.telemetry import Attitude, GlobalPosition, LocalPosition, parse_telemetry
 from edge.uav.base import Telemetry
-from edge.uav.navigation import Origin
 from protocols.core.errors import InputError
 from protocols.core.files import read_bytes
 from protocols.geometry.types import Floats
@@ -94,15 +94,17 @@ def _samples(messages: list[Any], system: int, unreadable: int, file: Path) -> T
     counts = Counter(message.get_type() for message in messages)
     kind = max("ATTITUDE_QUATERNION", "ATTITUDE", key=lambda name: counts[name])
     local = counts["LOCAL_POSITION_NED"] >= counts["GLOBAL_POSITION_INT"]
-    origin: Origin | None = None
+    frame = LocalFrame()
     newest, left_out = -1.0, 0
     for message in messages:
+        if message.get_type() == "HEARTBEAT":
+            frame.set_armed(bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), newest)
         telemetry = parse_telemetry(message)
         if telemetry is None or (isinstance(telemetry, Attitude) and message.get_type() != kind):
             continue
         if telemetry.boot_s < newest - _REBOOT_S:
             boots.append(([], []))
-            newest = -1.0
+            frame, newest = LocalFrame(), -1.0
         newest = max(newest, telemetry.boot_s)
         attitudes, positions = boots[-1]
         if isinstance(telemetry, Attitude):
@@ -112,16 +114,13 @@ def _samples(messages: list[Any], system: int, unreadable: int, file: Path) -> T
                 attitudes.append(telemetry)
             else:
                 left_out += 1
-        elif isinstance(telemetry, LocalPosition) and local and np.isfinite(telemetry.position).all():
-            positions.append((telemetry.boot_s, telemetry.position))
-        elif isinstance(telemetry, GlobalPosition) and not local:
-            if origin is None:  # home has height 0
-                origin = Origin(
-                    telemetry.latitude, telemetry.longitude, telemetry.altitude - telemetry.relative_altitude
-                )
-            positions.append(
-                (telemetry.boot_s, origin.to_ned(telemetry.latitude, telemetry.longitude, telemetry.altitude))
-            )
+        elif isinstance(telemetry, LocalPosition | GlobalPosition):
+            if isinstance(telemetry, GlobalPosition):
+                frame.take_global(telemetry, telemetry.boot_s)
+            elif local and np.isfinite(telemetry.position).all():
+                frame.take_local(telemetry, telemetry.boot_s)
+            if frame.position is not None and isinstance(telemetry, LocalPosition) == local:
+                positions.append((telemetry.boot_s, frame.position[1]))
     attitudes, positions = max(boots, key=lambda boot: len(boot[0]))
     if len(attitudes) < 2:
         raise InputError("no usable attitude in this log", file=file, remedy="record ATTITUDE at 20 Hz or more")

@@ -36,7 +36,7 @@ _LOST = {
 }
 """Errors of a send that cost the datagram only: a network that is away comes back, and the socket still receives."""
 _REMEDY = 'write it like "udpin:0.0.0.0:14550", "udpout:192.168.1.10:14550", "tcp:…" or "serial:/dev/ttyAMA0:921600"'
-_NETWORK = re.compile(r"(?P<kind>udp|udpin|udpout|tcp):(?P<host>[^:\s]+):(?P<port>\d{1,5})\Z")
+_NETWORK = re.compile(r"(?P<kind>udp|udpin|udpout|tcp):(?P<host>[^:/\s]+):(?P<port>\d{1,5})\Z")
 _SERIAL = re.compile(r"(?:serial:)?(?P<device>/[^:,\s]+|COM\d+)(?:[:,](?P<baud>\d{3,8}))?\Z")
 
 

@@ -23,7 +23,7 @@ MESSAGE_TYPES = (
     "SYSTEM_TIME",
     "TIMESYNC",
 )
-_MAX_DISTANCE_M = 100_000.0  # from the local origin, and of a height: beyond it the flat local frame means nothing
+MAX_DISTANCE_M = 100_000.0  # from the local origin, and of a height: beyond it the flat local frame means nothing
 _MAX_SPEED_M_S = 1_000.0  # beyond it a velocity is garbled
 
 
@@ -91,13 +91,13 @@ def parse_telemetry(message: Any) -> TelemetryReport | None:
     if kind == "LOCAL_POSITION_NED":
         position = np.array([message.x, message.y, message.z], np.float64)
         velocity = np.array([message.vx, message.vy, message.vz], np.float64)
-        if np.abs(position).max() > _MAX_DISTANCE_M or np.abs(velocity).max() > _MAX_SPEED_M_S:
+        if np.abs(position).max() > MAX_DISTANCE_M or np.abs(velocity).max() > _MAX_SPEED_M_S:
             return None
         return LocalPosition(boot, position, velocity)
     if kind == "GLOBAL_POSITION_INT":
         if (message.lat == 0 and message.lon == 0) or abs(message.lat) > 900_000_000:
             return None  # no fix yet
-        if max(abs(message.alt), abs(message.relative_alt)) > 1e3 * _MAX_DISTANCE_M:
+        if max(abs(message.alt), abs(message.relative_alt)) > 1e3 * MAX_DISTANCE_M:
             return None
         velocity = 0.01 * np.array([message.vx, message.vy, message.vz], np.float64)
         return GlobalPosition(

@@ -11,10 +11,9 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
-
 from edge.mavlink.dialect import AUTOPILOT, GIMBAL, mavlink
 from edge.mavlink.link.connection import Link, ReceivedMessage
+from edge.mavlink.roles.local_frame import LocalFrame
 from edge.mavlink.roles.telemetry import (
     Attitude,
     GimbalAttitude,
@@ -30,10 +29,8 @@ from protocols.geometry.types import Floats
 
 _TIMESYNC_PERIOD_S = 0.5  # between TIMESYNC requests
 _RATE_REQUEST_PERIOD_S = 5.0  # of rates, which an autopilot forgets when it reboots
-_MAX_POSITION_AGE_S = 1.5  # for how long a position is extrapolated at its velocity: one sent each second may be late
 _QUATERNION_S = 0.1  # after a quaternion, in which the same attitude in angles is not used
 _MAX_HEADING_AGE_S = 0.5  # an older heading is not used
-_MAX_LOCAL_AGE_S = 2.0  # without a local position, after which the global one is used
 _SOURCE_SILENT_S = 2.0  # after which another gimbal source may take over
 _REFUSAL_SHOWN_S = 10.0  # in the status
 _MAX_SPACING_S = 0.3  # of attitudes: at 4 Hz a target was placed on the ground from the start, at 2 Hz never
@@ -70,25 +67,26 @@ class Vehicle:
         self._gimbal_clock = VehicleClock()
         self._gimbal_source: tuple[int, int] | None = None
         self._gimbal_s = _NEVER
-        self.origin: Origin | None = None
+        self.frame = LocalFrame()
         self.mount: MountSample | None = None
         self.armed = False
         self.counters: Counter[str] = Counter()
         self._refusal = (_NEVER, "")
         self._attitude: tuple[float, Attitude] | None = None
-        self._last_position: tuple[float, Floats, Floats] | None = None
-        self._local_s = self._quaternion_s = self._sample_s = _NEVER
+        self._quaternion_s = self._sample_s = _NEVER
         self._spacing_s = 1.0 / rate_hz  # of samples, as a moving mean
         self._next_trip_s = self._next_ask_s = _NEVER
         self._first_s: float | None = None
         self._resets = (0, 0)
 
+    @property
+    def origin(self) -> Origin | None:
+        """Where positions count from; None while that is unknown."""
+        return self.frame.origin
+
     def motion_at(self, time_s: float) -> tuple[Floats, Floats] | None:
         """Position from ``origin`` and velocity (3,) NED [m, m/s] at a host time; None if not known of late."""
-        if self._last_position is None or abs(time_s - self._last_position[0]) >= _MAX_POSITION_AGE_S:
-            return None
-        at, position, velocity = self._last_position
-        return np.asarray(position + (time_s - at) * velocity), velocity
+        return self.frame.at(time_s)
 
     @property
     def clock_resets(self) -> tuple[int, int]:
@@ -141,6 +139,7 @@ class Vehicle:
             return []
         if kind == "HEARTBEAT":
             self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            self.frame.set_armed(self.armed, received.received_ns / NANOSECONDS)
             return []
         telemetry = parse_telemetry(message)
         if telemetry is None:
@@ -199,8 +198,9 @@ class Vehicle:
         resets = self.clock_resets
         if resets != self._resets:
             self._resets = resets
-            self._attitude = self._last_position = None
-            self._local_s = self._quaternion_s = self._sample_s = _NEVER
+            self._attitude = None
+            self.frame.restart()
+            self._quaternion_s = self._sample_s = _NEVER
             self._next_ask_s = self._next_trip_s = _NEVER
         return accepted
 
@@ -215,12 +215,9 @@ class Vehicle:
             rotation = ned_from_gimbal(telemetry, body[1].ned_from_body if fresh and body is not None else None)
             return [] if rotation is None else self._sample(host_ns, clock, rotation)
         if isinstance(telemetry, LocalPosition):
-            if self._local_s == _NEVER:
-                self.origin = None  # so far it was the vehicle's first global position, not the local frame's origin
-            self._local_s = time
-            self._last_position = (time, telemetry.position, telemetry.velocity)
+            self.frame.take_local(telemetry, time)
         elif isinstance(telemetry, GlobalPosition):
-            self._take_global(telemetry, time)
+            self.frame.take_global(telemetry, time)
         return []
 
     def _take_attitude(self, telemetry: Attitude, host_ns: int, quaternion: bool) -> list[MountSample]:
@@ -233,21 +230,6 @@ class Vehicle:
             return []
         self._attitude = (time, telemetry)
         return [] if self._gimbal else self._sample(host_ns, self.clock, telemetry.ned_from_body)
-
-    def _take_global(self, telemetry: GlobalPosition, time: float) -> None:
-        home = telemetry.altitude - telemetry.relative_altitude
-        if self._last_position is not None and time - self._local_s < _MAX_LOCAL_AGE_S:
-            if self.origin is None:
-                # The origin is where this global position has the vehicle's local position.
-                at, position, velocity = self._last_position
-                moved = position + (time - at) * velocity
-                place = Origin(telemetry.latitude, telemetry.longitude, telemetry.altitude).to_geodetic(*(-moved))
-                self.origin = Origin(*place)
-            return
-        if self.origin is None:
-            self.origin = Origin(telemetry.latitude, telemetry.longitude, home)
-        position = self.origin.to_ned(telemetry.latitude, telemetry.longitude, telemetry.altitude)
-        self._last_position = (time, position, telemetry.velocity)
 
     def _sample(self, host_ns: int, clock: VehicleClock, rotation: Floats) -> list[MountSample]:
         """The sample of an attitude; none if it is not later than the one before."""

@@ -11,6 +11,7 @@ from collections import deque
 import numpy as np
 
 from edge.uav.base import Telemetry
+from edge.uav.timing import ground_motion
 from edge.uav.timing.telemetry_offset import CONTRADICTION, OUTSIDE, OffsetEstimate, find_offset
 from edge.uav.timing.visual_rotation import VisualRotationEstimator
 from protocols.geometry.camera import Intrinsics
@@ -25,6 +26,8 @@ _PAUSE_S = 60.0  # in which oscillators drift by at most 6 ms
 _MAX_CHANGE_WHILE_TRACKING_S = 0.015  # a larger change of the offset is not applied while a tracker uses it
 _CONFIRMING_FRAMES = 8  # a quarter of a second at 30 fps
 _CLOCK_STEP_NS = 150_000_000  # a smaller step of the clock cannot be distinguished from delays
+
+_CONTRADICTIONS = (CONTRADICTION, ground_motion.CONTRADICTION)
 
 
 class CameraHostClock:
@@ -83,6 +86,10 @@ class ClockAligner:
     """
 
     def __init__(self, size: tuple[int, int], lens: Intrinsics, body_from_camera: Floats) -> None:
+        # For find_offset: its first import takes 2 s, in which no image would be processed in flight.
+        import scipy.interpolate
+        import scipy.spatial.transform  # noqa: F401
+
         self._mounting = np.asarray(body_from_camera, np.float64)
         self._visual = VisualRotationEstimator(size, lens, keep=round(_WINDOW_S * 60.0))
         self._samples: deque[Telemetry] = deque(maxlen=round(_WINDOW_S * 100.0))
@@ -94,8 +101,14 @@ class ClockAligner:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the images show another rotation than the telemetry: of another mounting, camera or convention."""
-        return self.reason.startswith(CONTRADICTION)
+        """Whether the images show another motion than the telemetry: of another mounting, camera or convention."""
+        return self.reason.startswith(_CONTRADICTIONS)
+
+    @property
+    def wrong_height(self) -> str:
+        """That the ground is at another height than that of take-off; "" where it is not."""
+        motion = None if self.estimate is None else self.estimate.motion
+        return "" if motion is None else motion.wrong_height
 
     @property
     def offset_s(self) -> float:
@@ -132,12 +145,19 @@ class ClockAligner:
     def _solve(self, time: float, tracking: bool) -> None:
         rotations = self._visual.relative_rotations()
         recent = (rotations.starts > time - _WINDOW_S) & (rotations.ends < time + _WINDOW_S)
-        rotations = type(rotations)(rotations.starts[recent], rotations.ends[recent], rotations.vectors[recent])
+        rotations = rotations.part(recent)
         samples = [sample for sample in self._samples if abs(sample.time - time) < _WINDOW_S + 2.0]
         result = find_offset(rotations, samples, self._mounting, (-_SEARCH_HALF_WIDTH_S, _SEARCH_HALF_WIDTH_S))
         if isinstance(result, str):
             late = f"{CONTRADICTION} at that time: they come more than {_SEARCH_HALF_WIDTH_S} s late"
-            self.reason = late if result == OUTSIDE else result
+            reason = late if result == OUTSIDE else result
+            if not self.contradicted or reason.startswith(
+                _CONTRADICTIONS
+            ):  # a hover shows nothing, and takes none back
+                self.reason = reason
+            return
+        moves = result.motion is not None and result.motion.agrees_in_shape
+        if self.reason.startswith(ground_motion.CONTRADICTION) and not moves:
             return
         self.reason = ""
         previous = self.estimate

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.uav.base import Telemetry
+from edge.uav.timing.ground_motion import GroundMotion, RelativeRotations, compare_ways
 from protocols.geometry.types import Bools, Floats
 
 _STEP_S = 1.0 / 60.0  # of the grid: half a frame at 30 fps, refined afterwards
@@ -37,20 +38,15 @@ _MAX_STD_S = 0.02  # of an accepted offset: at 30 degrees a second it is half a 
 
 @dataclass(frozen=True, slots=True)
 class OffsetEstimate:
-    """offset, std [s]. agreement: share of the visual rotation that the telemetry explains, 0 … 1."""
+    """offset, std [s]. agreement: share of the visual rotation that the telemetry explains, 0 … 1.
+
+    motion: the positions' way against the images'; None where there is none.
+    """
 
     offset: float
     std: float
     agreement: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RelativeRotations:
-    """Rotation vectors (n, 3) [rad] of the camera from ``starts`` to ``ends`` (n,) [s], in camera axes."""
-
-    starts: Floats
-    ends: Floats
-    vectors: Floats
+    motion: GroundMotion | None = None
 
 
 def find_offset(
@@ -73,7 +69,13 @@ def find_offset(
             return f"{CONTRADICTION}, but as of a camera turned by {90 * turns} degrees: check body_from_camera"
     if found.contradicts:
         return f"{CONTRADICTION}: check body_from_camera, and whether they come late"
-    if found.evidence < found.threshold:
+    correlated = found.evidence >= found.threshold
+    motion = None
+    if correlated or search is not None:  # else nothing is known of the offset
+        motion = compare_ways(visual, telemetry, body_from_camera, found.offset if correlated else 0.0)
+        if motion is not None and motion.contradiction:
+            return motion.contradiction
+    if not correlated:
         return "the camera rotated too little, or its rotation does not match the telemetry"
     if found.evidence - found.second < _MIN_LOG_RATIO:
         return "the offset is ambiguous: the rotation varies too little"
@@ -82,7 +84,7 @@ def find_offset(
     offset, std, agreement = _refine(found)
     if std > _MAX_STD_S:
         return f"its std would be {1e3 * std:.0f} ms: the camera rotated too little, or attitudes are too sparse"
-    return OffsetEstimate(offset, std, agreement)
+    return OffsetEstimate(offset, std, agreement, motion)
 
 
 def turned_about_axis(body_from_camera: Floats, turns: int) -> Floats:

@@ -15,7 +15,8 @@ from edge.uav.base import Telemetry
 from edge.uav.ground.ego_motion import EgoMotion
 from edge.uav.ground.image_plane import ImagePlane
 from edge.uav.ground.plane_pose import PlanePose
-from edge.uav.timing.telemetry_offset import MAX_FRAME_GAP_S, RelativeRotations
+from edge.uav.timing.ground_motion import RelativeRotations
+from edge.uav.timing.telemetry_offset import MAX_FRAME_GAP_S
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Image
@@ -31,8 +32,8 @@ class VisualRotationEstimator:
         self._plane = ImagePlane(size, lens)
         self._size = size
         self._ego: EgoMotion | None = None
-        self._last: tuple[float, Floats] | None = None
-        self._rotations: deque[tuple[float, float, Floats]] = deque(maxlen=keep)
+        self._last: tuple[float, PlanePose] | None = None
+        self._rotations: deque[tuple[float, float, Floats, Floats]] = deque(maxlen=keep)
 
     def update(self, image: Image | None, time: float, camera_from_ned: Floats) -> None:
         """Add an image of camera time ``time`` [s]; None: one that could not be decoded.
@@ -54,14 +55,15 @@ class VisualRotationEstimator:
         pose = ego.pose
         assert isinstance(pose, PlanePose)
         if report.trusted:
-            self.add(previous_s, time, pose.rotation @ previous.T)
-        self._last = time, pose.rotation
+            moved = previous.rotation @ (pose.centre - previous.centre) / -previous.centre[2]
+            self.add(previous_s, time, pose.rotation @ previous.rotation.T, moved)
+        self._last = time, pose
         if ego.frames_without_pose > _MAX_BLIND_FRAMES or not pose.centre[2] < 0.0:
             self._ego = None
 
-    def add(self, start: float, end: float, rotation: Floats) -> None:
-        """Add a rotation (3, 3) of the camera between two camera times that was estimated elsewhere."""
-        self._rotations.append((start, end, so3.log(rotation)))
+    def add(self, start: float, end: float, rotation: Floats, moved: Floats) -> None:
+        """Add a rotation (3, 3) of the camera between two camera times, and how it moved (3,), as they are kept."""
+        self._rotations.append((start, end, so3.log(rotation), moved))
 
     def reset(self) -> None:
         """Discard all rotations, for example after a clock step."""
@@ -70,16 +72,17 @@ class VisualRotationEstimator:
 
     def relative_rotations(self) -> RelativeRotations:
         """All rotations kept."""
-        table = np.array([(start, end, *vector) for start, end, vector in self._rotations]).reshape(-1, 5)
-        return RelativeRotations(table[:, 0], table[:, 1], table[:, 2:])
+        table = np.array([(start, end, *vector, *moved) for start, end, vector, moved in self._rotations]).reshape(
+            -1, 8
+        )
+        return RelativeRotations(table[:, 0], table[:, 1], table[:, 2:5], table[:, 5:])
 
     def _restart(self, image: Image, time: float, camera_from_ned: Floats) -> None:
         ego = EgoMotion(self._plane)
         working = cv2.cvtColor(ego.working_image(image), cv2.COLOR_BGR2GRAY)
-        ego.begin(
-            np.asarray(working, np.uint8), PlanePose(camera_from_ned, np.array([0.0, 0.0, -_NOMINAL_HEIGHT])), None
-        )
-        self._ego, self._last = ego, (time, camera_from_ned)
+        pose = PlanePose(camera_from_ned, np.array([0.0, 0.0, -_NOMINAL_HEIGHT]))
+        ego.begin(np.asarray(working, np.uint8), pose, None)
+        self._ego, self._last = ego, (time, pose)
 
 
 def median_tilt_rotation(telemetry: Sequence[Telemetry], body_from_camera: Floats) -> Floats:

@@ -13,6 +13,7 @@ import pytest
 
 from deploy.cli import run
 from deploy.simulation.flight import write_simulated_flight
+from edge.mavlink.dialect import mavlink
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from tests.support.videos import write_video
@@ -279,6 +280,54 @@ def test_attitudes_that_turn_otherwise_than_the_video_are_named(
     assert status == (2 if named is not None and "would" in named else 0)
     assert ("its attitudes" in printed.out + printed.err) == (named is not None)
     assert (named or "") in printed.out + printed.err
+
+
+@pytest.mark.parametrize(
+    ("written", "named"),
+    [
+        (lambda p: [47.39 + p[0] / 111_320.0, 8.54 + p[1] / 75_000.0, p[2]], "not latitude and longitude"),
+        (lambda p: [0.0, 0.0, p[2]], "its positions move by 0 m in a second"),
+        (lambda p: [p[0], p[1], p[2] - 40.0], "not above sea level"),
+    ],
+)
+def test_positions_that_are_no_metres_above_the_ground_are_named(
+    flight: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    written: Callable[[Floats], list[float]],
+    named: str,
+) -> None:
+    """They were believed: the target stood still with stds of 0.1 m, or was 28 m off."""
+    lines = (flight / "telemetry.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    changed = [",".join([*row[:5], *map(str, written(np.array(row[5:8], float)))]) for row in rows]
+    (tmp_path / "t.csv").write_text("\n".join([lines[0], *changed]) + "\n")
+    arguments = ["track", str(flight / "video.mp4"), "--target", TARGET, "--rig", str(flight / "rig.toml")]
+    status = run([*arguments, "--telemetry", str(tmp_path / "t.csv"), "--out", str(tmp_path / "out")])
+    printed = capsys.readouterr()
+    assert status == (0 if "sea level" in named else 2)
+    assert named in printed.out + printed.err
+
+
+@pytest.mark.parametrize("above_m", [0.0, 30.0])
+def test_a_log_whose_heights_are_not_above_the_ground_is_named(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], above_m: float
+) -> None:
+    """The local frame alone, which began 30 m lower: the target was 22 m off, with a std of 0.2 m."""
+    codec, data = mavlink.MAVLink(None, 1, 1), bytearray()
+    for time, *q, north, east, down in np.loadtxt(flight / "telemetry.csv", delimiter=",", skiprows=1):
+        boot_ms = round(1e3 * (time + 100.0))
+        for message in (
+            mavlink.MAVLink_attitude_quaternion_message(boot_ms, *q, 0, 0, 0),
+            mavlink.MAVLink_local_position_ned_message(boot_ms, north, east, down - above_m, 0, 0, 0),
+        ):
+            data += boot_ms.to_bytes(8, "big") + message.pack(codec)
+    (tmp_path / "t.tlog").write_bytes(data)
+    arguments = ["track", str(flight / "video.mp4"), "--target", TARGET, "--rig", str(flight / "rig.toml")]
+    assert run([*arguments, "--telemetry", str(tmp_path / "t.tlog"), "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "is not used" not in printed
+    assert ("not above sea level" in printed) == (above_m > 0.0)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])

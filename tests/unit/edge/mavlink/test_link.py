@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from edge.mavlink.dialect import mavlink
+from edge.mavlink.link import connection
 from edge.mavlink.link import signing as signing_module
 from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.link.framing import Framer
@@ -21,7 +22,7 @@ from protocols.core.errors import InputError
 
 KEY = bytes(range(32))
 UNIX_S = 1_700_000_000.0
-KINDS = ("HEARTBEAT", "ATTITUDE", "COMMAND_LONG")
+KINDS = ("HEARTBEAT", "ATTITUDE", "COMMAND_LONG", "GIMBAL_DEVICE_ATTITUDE_STATUS")
 
 
 class Sender:
@@ -109,6 +110,59 @@ def test_a_message_with_a_non_finite_number_is_rejected_and_counted(value: float
     sender.send(attitude(roll=value))
     assert kinds(link.poll()) == ["HEARTBEAT"]
     assert link.counters["refused.not_finite"] == 1
+
+
+def test_a_gimbals_attitude_counts_where_rates_are_not_available() -> None:
+    """ArduPilot sends NaN for what it does not know: no gimbal of it was ever heard."""
+    link, pipe = make_link()
+    sender, nan = Sender(pipe), math.nan
+    sender.send(heartbeat())
+    sender.send(
+        mavlink.MAVLink_gimbal_device_attitude_status_message(
+            0, 0, 1000, 44, [1.0, 0.0, 0.0, 0.0], nan, nan, nan, 0, nan, nan, 1
+        )
+    )
+    assert kinds(link.poll()) == ["HEARTBEAT", "GIMBAL_DEVICE_ATTITUDE_STATUS"]
+
+
+@pytest.mark.parametrize(
+    ("sent", "problem"),
+    [
+        (random.Random(1).randbytes(2000), "check the baud rate"),
+        (Sender(Pipe(), component=190).pack(heartbeat(autopilot=8)), "messages arrive, but no autopilot's heartbeat"),
+    ],
+    ids=["garbage", "a station"],
+)
+def test_what_arrives_in_place_of_the_vehicle_is_named(sent: bytes, problem: str) -> None:
+    link, pipe = make_link()
+    pipe.send(sent, None)
+    assert link.poll() == []
+    assert problem in link.problem
+    Sender(pipe).send(heartbeat())
+    link.poll()
+    assert link.problem == ""
+
+
+def test_a_tcp_connection_whose_other_side_is_gone_is_made_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight controller that is switched off closes nothing: its link was dead for a quarter of an hour."""
+    now, opened = [0], []
+
+    def open_anew(url: object) -> Pipe:
+        ours, theirs = Pipe.pair()
+        opened.append(theirs)
+        return ours
+
+    monkeypatch.setattr(connection, "open_transport", open_anew)
+    link = Link(parse_url("tcp:10.0.0.1:5760"), system=1, component=100, allowed=KINDS, now_ns=lambda: now[0])
+    for k in range(300):
+        now[0] = (k + 1) * 100_000_000
+        if opened and k < 50:
+            Sender(opened[0]).send(heartbeat())
+        if k > 200:
+            Sender(opened[-1]).send(heartbeat())
+        link.poll()
+    assert len(opened) == 2
+    assert now[0] - link.last_received_ns < 200_000_000
 
 
 def test_a_message_type_that_is_not_allowed_is_ignored() -> None:
@@ -220,7 +274,9 @@ def test_addresses_have_the_syntax_of_mavlink_tools(text: str, kind: str, number
     assert (url.kind, url.number) == (kind, number)
 
 
-@pytest.mark.parametrize("text", ["", "udpin", "udpout:host:0", "udpin:host:70000", "http://x", "serial:ttyS0", "a b"])
+@pytest.mark.parametrize(
+    "text", ["", "udpin", "udpout:host:0", "udpin:host:70000", "http://x", "serial:ttyS0", "a b", "udp://:1"]
+)
 def test_other_addresses_are_refused_with_a_remedy(text: str) -> None:
     with pytest.raises(InputError, match="write it like"):
         parse_url(text)

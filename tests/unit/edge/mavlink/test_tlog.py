@@ -57,3 +57,22 @@ def test_of_two_kinds_of_attitudes_and_positions_the_more_frequent_is_read(tmp_p
     log = read_tlog(tmp_path / "a.tlog")
     assert len(log.samples) == 100
     assert all(one.position is not None and one.position[2] == pytest.approx(-50.0) for one in log.samples)
+
+
+def test_heights_of_a_log_are_above_home_where_the_local_frame_began_elsewhere(tmp_path: Path) -> None:
+    """It was switched on 30 m below the place where it took off, and its estimator is reset after 5 s."""
+    codec, data = mavlink.MAVLink(None, 1, 1), bytearray()
+    for k in range(200):
+        boot_ms, reset_m = 60_000 + 50 * k, 60.0 if k > 100 else 0.0
+        messages = [
+            mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0),
+            mavlink.MAVLink_local_position_ned_message(boot_ms, reset_m, 0, -80, 0, 0, 0),
+        ]
+        if k % 10 == 0:
+            place = (473977000, 85456000, 538_000, 50_000)
+            messages.append(mavlink.MAVLink_global_position_int_message(boot_ms, *place, 0, 0, 0, 0))
+        for message in messages:
+            data += (1_700_000_000_000_000 + 50_000 * k).to_bytes(8, "big") + message.pack(codec)
+    (tmp_path / "a.tlog").write_bytes(data)
+    positions = [one.position for one in read_tlog(tmp_path / "a.tlog").samples[5:]]
+    assert positions == [pytest.approx([0.0, 0.0, -50.0], abs=0.02)] * 195

@@ -16,6 +16,7 @@ from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.link.transport import Pipe
 from edge.mavlink.roles.camera_messages import CameraMessages
 from edge.mavlink.roles.vehicle import MountSample, Vehicle
+from edge.uav.navigation import Origin
 
 BOOT_S, DELAY_S = 123.0, 0.01
 COMPANION = 191
@@ -208,6 +209,61 @@ def test_a_position_that_is_no_longer_reported_is_not_known_after_a_second() -> 
     update_tracking_status(status, None, under_test.vehicle, (640, 480), None, np.eye(3), 4 * 10**9)
     assert status.camera is None
     assert status.quaternion is not None
+
+
+@pytest.mark.parametrize(
+    ("local", "origin_m", "reset_m", "armed_s"),
+    [
+        pytest.param(True, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, id="as home"),
+        pytest.param(True, (70.0, -40.0, -30.0), (0.0, 0.0, 0.0), 0.0, id="switched on elsewhere, 30 m lower"),
+        pytest.param(True, (0.0, 0.0, 0.0), (80.0, -50.0, 4.0), 0.0, id="the estimator is reset in flight"),
+        pytest.param(False, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, id="global positions alone"),
+        pytest.param(False, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.5, id="home is set when it is armed"),
+        pytest.param(True, (0.0, 0.0, -25.0), (0.0, 0.0, 0.0), 1.5, id="home is set when it is armed, elsewhere"),
+    ],
+)
+def test_positions_count_from_home_height_in_one_frame_whatever_the_local_frame_does(
+    local: bool, origin_m: tuple[float, ...], reset_m: tuple[float, ...], armed_s: float
+) -> None:
+    """A local frame that began 30 m lower put the target 11 m off; one that was reset 94 m, with 0.3 m accuracy."""
+    one, home = VehicleUnderTest(), Origin(47.3977, 8.5456, 488.0)
+    samples: list[MountSample] = []
+    for k in range(120):
+        time_s = 0.05 * k
+        truth = np.array([10.0 * time_s, 0.0, -20.0])
+        if k % 20 == 0:
+            mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if time_s >= armed_s else 0
+            one.take(mavlink.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3), time_s)
+        if k % 4 == 0:
+            latitude, longitude, altitude = home.to_geodetic(*truth)
+            # Before it is armed its home is the first fix, 12 m too high; in flight a station sets another home.
+            relative_m = 20.0 - (12.0 if time_s < armed_s else 0.0) - (20.0 if time_s > 5.0 else 0.0)
+            place = round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude), round(1e3 * relative_m)
+            one.take(mavlink.MAVLink_global_position_int_message(boot_ms(time_s), *place, 1000, 0, 0, 0), time_s)
+        if local:
+            reported = truth - origin_m + (np.array(reset_m) if time_s > 3.0 else 0.0)
+            one.take(mavlink.MAVLink_local_position_ned_message(boot_ms(time_s), *reported, 10, 0, 0), time_s)
+        samples += one.attitude(time_s)
+    for sample in samples[40:]:
+        origin = one.vehicle.origin
+        assert sample.position is not None
+        assert origin is not None
+        time_s = 1e-9 * sample.host_ns
+        assert sample.position[2] == pytest.approx(-20.0, abs=0.1)
+        place_m = home.to_ned(*origin.to_geodetic(*sample.position))
+        assert place_m == pytest.approx([10.0 * time_s, 0.0, -20.0], abs=0.3)
+
+
+def test_a_velocity_that_is_not_sent_is_that_of_the_positions() -> None:
+    """Betaflight's positions come once or twice a second, with velocity 0."""
+    one, home = VehicleUnderTest(), Origin(47.3977, 8.5456, 488.0)
+    for time_s in (0.0, 1.0, 2.0):
+        latitude, longitude, _ = home.to_geodetic(10.0 * time_s, 0.0, 0.0)
+        place = round(1e7 * latitude), round(1e7 * longitude), 538_000, 50_000
+        one.take(mavlink.MAVLink_global_position_int_message(boot_ms(time_s), *place, 0, 0, 0, 0), time_s)
+    motion = one.vehicle.motion_at(2.9)
+    assert motion is not None
+    assert motion[0] == pytest.approx([29.0, 0.0, -50.0], abs=0.1)
 
 
 def test_a_gimbal_that_never_reports_is_named() -> None:

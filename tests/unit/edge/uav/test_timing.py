@@ -11,13 +11,16 @@ import pytest
 
 from edge.uav.base import Telemetry
 from edge.uav.navigation import Origin
-from edge.uav.timing.clock_alignment import CameraHostClock
-from edge.uav.timing.telemetry_offset import CONTRADICTION, OffsetEstimate, RelativeRotations, find_offset
+from edge.uav.timing import clock_alignment
+from edge.uav.timing.clock_alignment import CameraHostClock, ClockAligner
+from edge.uav.timing.ground_motion import GroundMotion, RelativeRotations, compare_ways
+from edge.uav.timing.telemetry_offset import CONTRADICTION, OffsetEstimate, find_offset
 from edge.uav.timing.telemetry_track import TelemetryTrack
 from edge.uav.timing.vehicle_clock import VehicleClock
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA, Flight, grid_times, rotation
 from edge.uav.world.noise import smoothed_noise
 from protocols.geometry import so3
+from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
 SECOND = 1_000_000_000
@@ -268,6 +271,71 @@ def test_attitudes_of_another_convention_or_mounting_contradict_the_images(
     found = find_offset(rotations, other, changed(np.eye(3), BODY_FROM_DOWN_CAMERA)[1], (-0.7, 0.7))
     assert (isinstance(found, str) and found.startswith(CONTRADICTION)) == bool(named)
     assert named in str(found)
+
+
+def yawing_flight(height: float = 50.0) -> tuple[RelativeRotations, list[Telemetry]]:
+    """Of a camera that looks straight down, and whose vehicle flies about at this height, yaws and never tilts."""
+    rng, times = np.random.default_rng(2), grid_times(20.0)
+    yaw = np.deg2rad(8.0) * smoothed_noise(rng, len(times), 1 / 120.0, 1.0, 0.6)
+    position = np.column_stack([4.0 * times, 10.0 * np.sin(0.4 * times), np.full(len(times), -height)])
+    path = Flight(times, position, np.column_stack([np.zeros((len(times), 2)), yaw]))
+    visual, telemetry = simulated_rotations_and_telemetry(path, 0.1, 30.0, noise=0.0)
+    camera = path.at(visual.starts)[0] @ BODY_FROM_DOWN_CAMERA
+    ways = path.at(visual.ends)[1] - path.at(visual.starts)[1]
+    moved = np.einsum("nji,nj->ni", camera, ways) / height + 0.0002 * rng.standard_normal(ways.shape)
+    placed = [replace(one, position=path.at(np.array([one.time - 0.1]))[1][0]) for one in telemetry]
+    return replace(visual, moved=moved), placed
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 20.0, 90.0, 180.0, 270.0])
+def test_a_turned_camera_is_found_by_its_way_where_it_looks_down_and_the_vehicle_only_yaws(turn_deg: float) -> None:
+    """Its rotation is the same however it is turned; targets were on the other side, tens of metres off."""
+    visual, telemetry = yawing_flight()
+    turned = BODY_FROM_DOWN_CAMERA @ so3.exp(np.radians([0.0, 0.0, turn_deg]))
+    found = find_offset(visual, telemetry, turned, (-0.7, 0.7))
+    if turn_deg > 45.0:
+        assert found == (
+            f"positions move otherwise than the images, but as of a camera turned by {360.0 - turn_deg:.0f} degrees: "
+            "check body_from_camera, and the heading"
+        )
+    else:
+        assert isinstance(found, OffsetEstimate)
+        assert found.motion is not None
+        assert found.motion.wrong_height == ""
+
+
+@pytest.mark.parametrize(("changed", "height_m"), [([1, 1, 1], None), ([1, 1, 1.4], 50), ([1, 1, 0.8], 50)])
+def test_the_way_shows_the_height_above_the_ground(changed: list[float], height_m: int | None) -> None:
+    visual, telemetry = yawing_flight()
+    telemetry = [replace(one, position=one.position * changed) for one in telemetry if one.position is not None]
+    motion = compare_ways(visual, telemetry, BODY_FROM_DOWN_CAMERA, 0.1)
+    assert motion is not None
+    assert not motion.stands_still
+    shown = f"the images move as from {height_m} m above the ground, not {50.0 * changed[2]:.0f} m"
+    assert motion.wrong_height == ("" if height_m is None else shown)
+
+
+def test_a_contradicted_mounting_is_trusted_again_only_by_a_way_that_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a hover the images show nothing, and positions of the wrong mounting were given again."""
+    visual, telemetry = yawing_flight()
+    way = compare_ways(visual, telemetry, BODY_FROM_DOWN_CAMERA, 0.1)
+    turned = compare_ways(visual, telemetry, BODY_FROM_DOWN_CAMERA @ np.diag([-1.0, -1.0, 1.0]), 0.1)
+    assert isinstance(turned, GroundMotion)
+    lens = Intrinsics(320, 240, np.array([[300.0, 0.0, 160.0], [0.0, 300.0, 120.0], [0.0, 0.0, 1.0]]))
+    aligner = ClockAligner((320, 240), lens, BODY_FROM_DOWN_CAMERA)
+    aligner.handle_sample(telemetry[0])
+    results: list[OffsetEstimate | str] = [
+        turned.contradiction,
+        "the camera rotated too little",
+        OffsetEstimate(0.1, 0.01, 0.9),
+        OffsetEstimate(0.1, 0.01, 0.9, way),
+    ]
+    monkeypatch.setattr(clock_alignment, "find_offset", lambda *arguments: results.pop(0))
+    seen = []
+    for time in (0.0, 7.0, 10.0, 13.0, 16.0):
+        aligner.handle_frame(None, time, tracking=False)
+        seen.append(aligner.contradicted)
+    assert seen == [False, True, True, True, False]
 
 
 def test_geodetic_conversion_round_trips() -> None:
