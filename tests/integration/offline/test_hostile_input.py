@@ -21,7 +21,7 @@ from deploy.config.agents import HubConfig
 from deploy.config.file import load
 from hub.calibration.pipeline import calibrate
 from protocols.core.errors import InputError
-from protocols.core.files import write_together
+from protocols.core.files import completed_file, write_together
 from protocols.log.write.writer import LogWriter
 from protocols.session.folder import write_observations
 from protocols.session.observations import Observations
@@ -152,6 +152,31 @@ def test_one_file_that_cannot_be_written_leaves_none(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="second"):
         write_together({tmp_path / "first": "1", tmp_path / "second": "2", tmp_path / "third": "3"})
     assert [path.name for path in tmp_path.iterdir()] == ["second"]
+
+
+def test_an_output_goes_through_links_and_never_takes_the_place_of_a_device(tmp_path: Path) -> None:
+    """A renamed file takes the place of a link; root's took that of /dev/null."""
+    shared, link, pipe = tmp_path / "shared.csv", tmp_path / "link.csv", tmp_path / "pipe.csv"
+    shared.write_text("old")
+    link.symlink_to("shared.csv")
+    os.mkfifo(pipe)
+    write_together({link: "new"})
+    assert (link.is_symlink(), shared.read_text()) == (True, "new")
+    with completed_file(link) as part:
+        part.write_text("newer")
+    assert (link.is_symlink(), shared.read_text()) == (True, "newer")
+    with pytest.raises(InputError, match="is a device or a pipe"):
+        write_together({pipe: "new"})
+    with pytest.raises(InputError, match="is a device or a pipe"), completed_file(pipe):
+        pass
+    assert pipe.is_fifo()
+
+
+def test_an_interrupt_while_modules_are_imported_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "cyclopts.py").write_text("raise KeyboardInterrupt")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-m", "deploy"], env=environment, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (130, b"syncline: interrupted\n")
 
 
 @pytest.mark.parametrize("out", ["file", "file/below", "x" * 300, "locked", "locked/below"])
