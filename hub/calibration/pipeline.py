@@ -206,23 +206,27 @@ def _check(
     check_stature(found.trajectories)
     if again is None:
         return
+    fits = [(len(found.cameras), -_median_rms(found), 1)]
     for factor in enlargements(rig, observations):
         tracks = {
             key: replace(track, pixels=factor * (track.pixels + 0.5) - 0.5)
             for key, track in observations.tracks.items()
         }
-        try:
+        with suppress(Refused):
             enlarged = again(replace(observations, tracks=tracks))
-        except Refused:
-            continue
-        rms = [float(np.median([one.rms_px for one in fit.cameras.values()])) for fit in (enlarged, found)]
-        more = len(enlarged.cameras) - len(found.cameras)
-        if more >= 0 and rms[0] < factor * rms[1] * (1.0 if more else _FAR_BETTER):
-            raise Refused(
-                f"as those of pictures of 1/{factor} the size that rig.toml states, the rows place "
-                f"{len(enlarged.cameras)} cameras and fit to {rms[0] / factor:.2g} px; as given, {len(found.cameras)} "
-                f"cameras and {rms[1]:.2g} px: correct size and matrix, or scale u and v"
-            )
+            fits.append((len(enlarged.cameras), -_median_rms(enlarged) / factor, factor))
+    cameras, fit, factor = max(fits)
+    if factor > 1 and (cameras > len(found.cameras) or -fit < _FAR_BETTER * _median_rms(found)):
+        raise Refused(
+            f"as those of pictures of 1/{factor} the size that rig.toml states, the rows place {cameras} cameras and "
+            f"fit to {-fit:.2g} px; as given, {len(found.cameras)} cameras and {_median_rms(found):.2g} px: correct "
+            "size and matrix, or scale u and v"
+        )
+
+
+def _median_rms(found: Calibration) -> float:
+    """Residuals of the median camera [px]."""
+    return float(np.median([camera.rms_px for camera in found.cameras.values()]))
 
 
 def _between_settings(
