@@ -22,7 +22,7 @@ _MANY_TIMES = 10  # distinct ones that are all whole by chance: of stamps in ten
 _MANY_ROWS, _SMALL_PICTURE = 100, 0.55
 """Rows of a camera, and the share of its width and of its height that they reach in every camera: those of pictures of
 half the size reach a half."""
-_ENLARGEMENTS = (2, 3, 4)
+_ENLARGEMENTS = (2, 3, 4)  # whole parts of a picture that detectors are given to save time
 _MAX_OUTSIDE_SHARE, _MAX_INSIDE_SHARE = 0.01, 0.02
 """Share of rows outside the image above which a warning is given, and of these with u and v swapped, for false ones."""
 _MANY_OUTSIDE_SHARE, _LARGE_PICTURE = 0.1, 1.1
