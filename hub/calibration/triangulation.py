@@ -25,8 +25,9 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration, TrajectoryTable
 from protocols.session.observations import Observations
-from protocols.session.rig import Rig
+from protocols.session.rig import METRES_PER_UNIT, Rig
 
+_SOUND_M_S = 340.0  # at 1000 times its size, what walks, drives or flies is beyond it
 _CAMERA_AXES_UP = np.diag([1.0, -1.0, -1.0])
 _CONVENTIONS: dict[str, Callable[[Pose], Pose]] = {
     "translation is the camera's place in the world": lambda pose: Pose(pose.rotation, pose.translation),
@@ -114,7 +115,7 @@ def _triangulate(
     if not any(len(table.time) for table in tables):
         raise Refused("no label is seen by two cameras within 0.2 s of each other", unused)
     sigmas = _sigmas(reconstruction)
-    warnings = list(prepared.warnings)
+    warnings = [*prepared.warnings, *_unlikely_speed(rig, tables)]
     for name, (sigma, calibrated_rms) in larger_residuals(reconstruction, known).items():
         warnings.append(f"{name}: residuals of {sigma:.1f} px, {calibrated_rms:.1f} px when it was calibrated")
     triangulated = {table.label for table in tables if len(table.time)}
@@ -125,6 +126,17 @@ def _triangulate(
         tuple(label for label in observations.labels if label not in triangulated),
         tuple(warnings),
     )
+
+
+def _unlikely_speed(rig: Rig, tables: tuple[TrajectoryTable, ...]) -> tuple[str, ...]:
+    """A warning where what is triangulated moves faster than sound by the calibration's units."""
+    if rig.metadata.get("scale", "metric") != "metric":
+        return ()
+    speeds = [np.linalg.norm(np.diff(one.position, axis=0), axis=1) / np.diff(one.time) for one in tables]
+    typical = METRES_PER_UNIT[rig.units] * float(np.median(np.concatenate([np.zeros(1), *speeds])))
+    if typical < _SOUND_M_S:
+        return ()
+    return (f"it moves at {typical:.3g} m/s as a rule: the calibration's positions seem not to be in {rig.units}",)
 
 
 def _reconstruct(prepared: PreparedSession, known: Mapping[str, CameraCalibration], names: list[str]) -> Reconstruction:

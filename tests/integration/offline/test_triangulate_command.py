@@ -163,6 +163,19 @@ def test_a_calibration_that_contradicts_the_rows_is_refused(
     assert not out.exists()
 
 
+def test_millimetres_where_metres_are_stated_are_warned_of(session: Path, tmp_path: Path, capsys: Capture) -> None:
+    tables = tomllib.loads((session / "truth_calibration.toml").read_text())
+    for factor in (1.0, 1000.0):
+        for name, table in tables.items():
+            if name != "metadata":
+                table["translation"] = [factor * value for value in table["translation"]]
+                table.pop("position", None)
+        (tmp_path / "known.toml").write_text(tomli_w.dumps(tables))
+        known, out = str(tmp_path / "known.toml"), tmp_path / "track.csv"
+        assert run(["triangulate", str(session), "--calibration", known, "--out", str(out)]) == 0
+        assert ("positions seem not to be in m" in capsys.readouterr().out) == (factor > 1.0)
+
+
 @pytest.mark.parametrize(
     ("written", "report"),
     [
