@@ -23,13 +23,17 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: what is wrong with a video is said in one line
 
+EXIT_INTERRUPTED, _INTERRUPTED = 130, "syncline: interrupted"
 gc.disable()  # nothing of what is imported is garbage: to search it took a thirtieth of a short command's time
-from cyclopts import App, CycloptsError  # noqa: E402
-from cyclopts.exceptions import UnknownCommandError  # noqa: E402
+try:
+    from cyclopts import App, CycloptsError
+    from cyclopts.exceptions import UnknownCommandError
 
-from protocols.core.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT, SynclineError  # noqa: E402
-from protocols.core.version import VERSION  # noqa: E402
-
+    from protocols.core.errors import EXIT_BUG, EXIT_DONE, EXIT_INPUT, SynclineError
+    from protocols.core.version import VERSION
+except KeyboardInterrupt:  # the imports are a short command's longest part
+    print(_INTERRUPTED, file=sys.stderr)
+    raise SystemExit(EXIT_INTERRUPTED) from None
 gc.freeze()
 gc.enable()
 
@@ -128,8 +132,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         print(f"syncline: {text}; see `syncline {command}--help`", file=sys.stderr)
         return EXIT_INPUT
     except KeyboardInterrupt:
-        print("syncline: interrupted", file=sys.stderr)
-        return 130
+        print(_INTERRUPTED, file=sys.stderr)
+        return EXIT_INTERRUPTED
     except (BrokenPipeError, SystemExit):
         # The reader of our output has closed the pipe (a pager, head): not an error. Rich exits for it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.files import destination
 
 Flag = Annotated[bool, Parameter(negative="")]
 Json = Annotated[bool, Parameter(negative="", help="Print the result as JSON.")]
@@ -50,10 +51,10 @@ def check_seed(seed: int) -> None:
 
 
 def check_file(out: Path, name: str, *inputs: Path | None, option: str = "--out") -> None:
-    """Raise InputError if ``out`` is a folder, or one of the ``inputs``. name: of what it has to be."""
+    """Raise InputError if ``out`` is a folder, a device, or one of the ``inputs``. name: of what it has to be."""
     if out.is_dir():
         raise InputError("this is a folder, but a file is needed", file=out, remedy=f"give {option} the name of {name}")
-    if out.resolve() in [given.resolve() for given in inputs if given is not None]:
+    if destination(out).resolve() in [given.resolve() for given in inputs if given is not None]:
         raise InputError("this file is read, and would be lost", file=out, remedy=f"give {option} another name")
 
 

@@ -32,6 +32,7 @@ _STEP_S = 0.1
 """Time between evaluated instants [s]."""
 _WARM_UP_S = 5.0
 """Time in which cameras learn the background and the height model [s]; also scored without it."""
+_KEPT_UP = 0.7  # of a camera's frames: beside this a walk has gaps of more than two frames
 _MAX_EXTRAPOLATION_S = 0.25
 """Time after publication for which a track is extrapolated and counts [s]."""
 
@@ -82,7 +83,7 @@ class PeopleComparison:
     """Tracking scores of a log against the scene.
 
     on_floor, in_space: scores of floor positions and of 3-D body centres [m], from the first frame on. begun: on the
-    floor, without the first 5 s; no limits apply to it. frames: number by camera.
+    floor, without the first 5 s; no limits apply to it. frames: number by camera. fps: that a camera films.
     """
 
     on_floor: MotScores
@@ -91,6 +92,7 @@ class PeopleComparison:
     seconds: float
     people: int
     frames: dict[str, int]
+    fps: float
 
     @property
     def good(self) -> bool:
@@ -129,6 +131,10 @@ class PeopleComparison:
             f"{self.on_floor.labels} track labels"
         )
         console.print("within the limits" if self.good else "NOT within the limits")
+        rate = min(self.frames.values(), default=0) / max(self.seconds, 1e-9)
+        if not self.good and rate < _KEPT_UP * self.fps:
+            share = f"{rate:.1f} of {self.fps:g} frames a second"
+            console.print(f"this machine searched {share}: close other programs, or give fewer --cameras")
         console.print(f"log {out / LOG}, tracks {out / 'tracks.csv'}", soft_wrap=True)
         known = out / "config" / KNOWN_CALIBRATION
         again = f"syncline replay {out / LOG} --through hub --calibration {known} --out again.mcap"
@@ -176,6 +182,7 @@ def score_log(log: Path, scene: PeopleScene) -> tuple[PeopleComparison, list[str
         seconds=max(end - begin, 0.0),
         people=len(scene.people),
         frames=dict(frames),
+        fps=reference.fps,
     ), rows
 
 

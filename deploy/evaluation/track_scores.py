@@ -15,6 +15,7 @@ from protocols.core.errors import InputError
 from protocols.geometry.types import Bools, Floats
 
 NEAR_PX = 20.0  # of a track that is on its target
+_MIN_NEAR_SHARE, _OTHER_NEAR_SHARE = 0.5, 0.8  # of visible frames near a truth as it is, and in another convention
 _REACQUIRED_FRAMES = 5  # in a row within the limit: one alone may be chance
 _SEARCH_FRAMES = 60  # 2 s at 30 Hz after it is half visible again: later counts as never
 _EXIT_GRACE_FRAMES = 2  # frames after an exit in which the target may still be reported visible
@@ -38,12 +39,18 @@ def score(
     """Scores as fractions (0 to 1) and counts; scores without any frame are omitted.
 
     in_frame_20px; out_20px, out_one_length; visible_while_out (from the third frame of an exit); visible_while_in;
-    exits, reacquired, frames_to_reacquire (mean). size: (width, height) of the image [px].
+    exits, reacquired, frames_to_reacquire (mean). size: (width, height) of the image [px]. Raises InputError where no
+    frame is common, or the truth is in another convention.
     """
     known = [row for row in rows if row.frame in truth and math.isfinite(truth[row.frame]["x"])]
     if not known:
         raise InputError("the truth has none of the tracked frames", remedy="give the truth of this video")
     true_rows = [truth[row.frame] for row in known]
+    if convention := other_convention(known, true_rows, size):
+        raise InputError(
+            f"the truth fits the track if its {convention}",
+            remedy="give the target's centre in the video's pixels, from the top left",
+        )
     error = np.array(
         [
             math.hypot(row.estimate.x - true_row["x"], row.estimate.y - true_row["y"])
@@ -85,6 +92,30 @@ def score(
         if found:
             scores["frames_to_reacquire"] = float(np.mean(found))
     return scores
+
+
+def other_convention(rows: Sequence[TrackedFrame], true_rows: Sequence[dict[str, float]], size: tuple[int, int]) -> str:
+    """What the truth's x and y are, where the visible target is at few of them as they are, and at most as that."""
+    visible = [k for k, row in enumerate(rows) if row.estimate.state is TrackState.VISIBLE]
+    found = np.array([(rows[k].estimate.x, rows[k].estimate.y) for k in visible]).reshape(-1, 2)
+    given = np.array([(true_rows[k]["x"], true_rows[k]["y"]) for k in visible]).reshape(-1, 2)
+    sides = np.array([(rows[k].estimate.width, rows[k].estimate.height) for k in visible]).reshape(-1, 2)
+
+    def share(places: Floats) -> float:
+        return float((np.linalg.norm(places - found, axis=1) <= NEAR_PX).mean()) if len(found) else 1.0
+
+    factor = float(np.median(np.linalg.norm(found, axis=1)) / max(np.median(np.linalg.norm(given, axis=1)), 1e-9))
+    others = {
+        "x, y are the top left corner": given + 0.5 * sides,
+        "x and y are swapped": given[:, ::-1],
+        "x, y are fractions of width and height": given * size,
+        "y counts from the bottom": [0.0, size[1] - 1.0] + given * [1.0, -1.0],
+        f"pixels are of pictures {1.0 / factor:.2g} times as large": factor * given,
+    }
+    if share(given) >= _MIN_NEAR_SHARE:
+        return ""
+    best = max(others, key=lambda name: share(others[name]))
+    return best if share(others[best]) >= _OTHER_NEAR_SHARE else ""
 
 
 def _frames_to_reacquire(last_out: int, half: Bools, error: Floats) -> float | None:

@@ -7,11 +7,13 @@ et al., "HOTA: a higher order metric for evaluating multi-object tracking" (2021
 
 from __future__ import annotations
 
+import cmath
 import io
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,6 +25,13 @@ from protocols.geometry.types import Bools, Floats, Ints
 
 MATCH_M = 0.5
 """Largest distance on the ground [m] of a track from the person that it follows."""
+_MIN_RECALL, _OTHER_FRAME = 0.5, 0.8
+"""Recall below which another frame of the truth is looked for, and from which one is named."""
+_MIN_COMMON, _MIN_CORRELATION, _MIN_EXTENT_M = 10, 0.9, 2.0
+"""Common instants, correlation and extent of a person's and a track's path that give a frame: a point fits anything."""
+_MAX_LATE_S = 10.0  # of times that are tried: clocks that were set by hand differ by seconds
+_MOST_INSTANTS = 200  # in which another frame is looked for, to bound its time
+_SMALL = 0.03  # change of scale, or turn [rad], that a path's noise explains
 _MAX_VALUE = 1e9  # of a time or a coordinate: float64 then still resolves 0.1 µm
 _INSTALL = "pip install --no-deps trackeval (its other requirements, a second OpenCV among them, are not needed)"
 
@@ -108,7 +117,8 @@ def score_tracks(
 
     moda, mota, idf1, hota, deta, assa: up to 1. recall, precision. truths, matches, misses, false, switches, fragments:
     counts. error: mean distance of matches [m]. people: of the truth. tracks: that were scored. instants: scored; left:
-    instants of the truth outside the followed span. Raises InputError where TrackEval is missing or nothing overlaps.
+    instants of the truth outside the followed span. Raises InputError where TrackEval is missing, nothing overlaps, or
+    the truth fits the tracks in another frame alone.
     """
     metrics = trackeval_metrics()
     every = np.unique(truth.time)
@@ -119,6 +129,11 @@ def score_tracks(
         what = f"the truth ({spans[0]}) and the tracks ({spans[1]}) do not overlap"
         raise InputError(what, remedy="give its times on the calibration's reference clock")
     found = _places_at(tracks, moments, times)
+    if other := other_frame(truth, tracks, times, units_per_m):
+        raise InputError(
+            f"the truth is in another frame than the tracks: it fits them {other}",
+            remedy="give it in the calibration's world and units, at times on the reference clock",
+        )
     gt_ids, ids, similarity = [], [], []
     for index, moment in enumerate(moments):
         here = truth.select(truth.time == moment)
@@ -157,6 +172,65 @@ def score_tracks(
         "instants": len(moments),
         "left": len(every) - len(moments),
     }
+
+
+def other_frame(truth: GroundTruth, tracks: Sequence[ScoredTrack], times: Sequence[float], units_per_m: float) -> str:
+    """How the truth fits the tracks at other times, or in another world or unit; "" where it fits, or nothing helps.
+
+    The similarity of the plane, mirrored or not, in which one person's path fits a track's best has to fit most places
+    of all.
+    """
+    reach, step = MATCH_M * units_per_m, float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    if not tracks or _recall(truth, tracks, times, reach) >= _MIN_RECALL:
+        return ""
+    moments = np.unique(truth.time)
+    some = moments[np.linspace(0, len(moments) - 1, min(len(moments), _MOST_INSTANTS)).astype(int)]
+    truth = truth.select(np.isin(truth.time, some))
+    lates = np.arange(-_MAX_LATE_S, _MAX_LATE_S, max(step, 0.1))
+    recalls = np.array([_recall(replace(truth, time=truth.time + late), tracks, times, reach) for late in lates])
+    if recalls.max() >= _OTHER_FRAME:
+        late = float(lates[recalls == recalls.max()].mean())
+        return f"{abs(late):.1f} s {'later' if late > 0 else 'earlier'}"
+    given, best, text = truth.place @ np.array([1.0, 1j]), 0.0, ""
+    paths = (place @ np.array([1.0, 1j]) for place in _places_at(tracks, truth.time, times).values())
+    for person, path in itertools.product(np.unique(truth.person), list(paths)):
+        common = (truth.person == person) & np.isfinite(path)
+        if common.sum() < _MIN_COMMON or np.abs(path[common] - path[common][0]).max() < _MIN_EXTENT_M * units_per_m:
+            continue
+        for source in (given, given.conj()):
+            middle, target = source[common].mean(), path[common].mean()
+            a, b = source[common] - middle, path[common] - target
+            product, power = np.vdot(a, b), np.vdot(a, a).real
+            if abs(product) <= _MIN_CORRELATION * np.sqrt(power * np.vdot(b, b).real):
+                continue
+            factor = product / power
+            moved = factor * (source - middle) + target
+            recall = _recall(replace(truth, place=np.column_stack([moved.real, moved.imag])), tracks, times, reach)
+            if recall > best:
+                best, text = recall, _similarity_text(source is not given, factor, target - factor * middle, reach)
+    return text if best >= _OTHER_FRAME else ""
+
+
+def _similarity_text(mirrored: bool, factor: complex, shift: complex, reach: float) -> str:
+    """A similarity of the plane in words, without what changes nothing. shift: beyond ``reach`` it counts."""
+    degrees = math.degrees(cmath.phase(factor))
+    parts = [
+        (mirrored, "with the sign of y changed"),
+        (abs(math.log(abs(factor))) > _SMALL, f"times {abs(factor):.3g}"),
+        (abs(math.radians(degrees)) > _SMALL, f"turned by {degrees:.0f} degrees"),
+        (abs(shift) > 0.5 * reach, f"shifted by {shift.real:.2f}, {shift.imag:.2f}"),
+    ]
+    return ", ".join(text for counts, text in parts if counts)
+
+
+def _recall(truth: GroundTruth, tracks: Sequence[ScoredTrack], times: Sequence[float], reach: float) -> float:
+    """Share of the truth's places in the followed span that have a track within ``reach``."""
+    here = truth.select((truth.time >= times[0]) & (truth.time <= times[-1]))
+    places = np.array(list(_places_at(tracks, here.time, times).values()))
+    if not len(here.time):
+        return 0.0
+    distance = np.linalg.norm(places - here.place, axis=2)
+    return float((np.nan_to_num(distance, nan=np.inf).min(axis=0) <= reach).mean())
 
 
 def _inside(place: Floats, area: tuple[float, float, float, float] | None) -> Bools:

@@ -23,6 +23,7 @@ COVERAGE_GRID = (8, 6)
 MIN_VIEWS = 8
 """From so many views on a lens counts as measured; fewer give one with a wide std, if they fix it at all."""
 _LEAST_VIEWS, _FEW_FOCAL_STD = 3, 0.05  # of which a focal length follows at all; relative, for few views
+_CHECK_BOARD = "check its kind, squares (not the corners between them) and dictionary"
 _MAX_VIEWS = 40  # bounds the solution's time
 _MIN_COVERAGE = 0.5  # of the image's cells: distortion is extrapolated beyond
 _MAX_RMS = 1.0  # px, at a width of up to 1280
@@ -30,9 +31,10 @@ _MAX_FOCAL_STD = 0.004  # relative
 _PRINCIPAL_POINT_STD = 0.012  # of the larger image side, of usual cameras about the middle
 _FEW_FLAGS = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
 _OUTLIER_RATIO = 2.5  # times the median view's rms
-_BOWED, _CONVERGED, _MAX_ROUNDS = 16.27, 1e-6, 20
-"""Chi-squared with 3 degrees of freedom above which a board is no plane (0.1 % of flat ones), share of the cost by
-which the last round of its adjustment lowers it, and the most rounds."""
+_SHAPE = 4  # parameters of a board's shape: of a quadratic surface, and the rows' distance over the columns', less 1
+_MISSHAPEN, _CONVERGED, _MAX_ROUNDS = {3: 16.27, 4: 18.47}, 1e-6, 20
+"""Chi-squared by degrees of freedom above which a board is no plane of squares (0.1 % of true ones), share of the cost
+by which the last round of its adjustment lowers it, and the most rounds."""
 _RIDGE = 1e-12  # relative, of normal equations: of what no view determines a std follows that is refused
 
 
@@ -42,7 +44,8 @@ class LensCalibration:
 
     rms_px: root mean square reprojection error of the corners. focal_std: relative std of the focal length. views:
     number used. cells: (6, 8) number of corners per grid cell. coverage: fraction of cells with any. bow: how far the
-    board departs from a plane [squares], 0 = not measurably.
+    board departs from a plane [squares], 0 = not measurably. stretch: by how much its squares are longer down than
+    across, relative.
     """
 
     intrinsics: Intrinsics
@@ -52,13 +55,14 @@ class LensCalibration:
     cells: Ints
     coverage: float
     bow: float
+    stretch: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
     """A lens and the board's poses in it.
 
-    parameters: fx, fy, cx, cy, the distortions, and the coefficients of the board's surface (`_quadratic`). poses:
+    parameters: fx, fy, cx, cy, the distortions, and the board's shape (`_by_shape`). poses:
     (views, 6) rotation vectors and translations [squares].
     """
 
@@ -91,11 +95,12 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
     Raises Refused where the views are too few, too similar or do not fit, with advice on what to record instead.
     """
     if not views:
-        raise Refused("the board is in no frame: check its kind, squares and dictionary, and that it is sharp and lit")
+        raise Refused(f"the board is in no frame: {_CHECK_BOARD}, and that it is sharp and lit")
     few = len(views) < MIN_VIEWS
     held = few and not fisheye
     if len(views) < _LEAST_VIEWS:
-        raise Refused(f"the board is seen in {len(views)} different views, {MIN_VIEWS} are needed: film it longer")
+        found = f"the board is seen in {len(views)} different views"
+        raise Refused(f"{found}, {MIN_VIEWS} are needed: film it longer, or {_CHECK_BOARD}")
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MAX_VIEWS)).round().astype(int))
     # About the board's middle: elsewhere the slope of a bow would be a stretch.
     corners = np.concatenate([view.points for view in views])
@@ -134,10 +139,12 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
             "tilt the board by 20 to 45 degrees in different directions, near and far"
         )
     points = np.concatenate([view.points for view in accepted])
-    plane, heights = np.column_stack([points[:, :2], np.ones(len(points))]), _quadratic(points) @ fit.parameters[-3:]
+    heights = (_by_shape(points) @ fit.parameters[-_SHAPE:])[:, 2]
+    plane = np.column_stack([points[:, :2], np.ones(len(points))])
     bow = float(np.ptp(heights - plane @ np.linalg.lstsq(plane, heights)[0]))
     counts = _corner_counts(accepted, size)
-    return LensCalibration(_lens(fit, size, fisheye), rms, std, len(accepted), counts, coverage, bow)
+    stretch = float(fit.parameters[-1])
+    return LensCalibration(_lens(fit, size, fisheye), rms, std, len(accepted), counts, coverage, bow, stretch)
 
 
 def intrinsics_from_field_of_view(size: tuple[int, int], degrees: float, fisheye: bool) -> Intrinsics:
@@ -159,18 +166,20 @@ def _with_board(
     """The fit, with the board's shape where the corners ask for one, its residuals, and the columns of the parameters
     that are estimated.
 
-    A sheet that is bowed by a hundredth of its width made focal lengths 1.4 % wrong at a stated 0.15 %. OpenCV's own
-    estimate of a board's shape needs all corners in each view. held: only what a few views determine is estimated,
-    focal length, k1 and k2; the rest as of usual lenses.
+    A sheet that is bowed by a hundredth of its width made focal lengths 1.4 % wrong at a stated 0.15 %, one that was
+    printed 2 % too wide 1.2 %. OpenCV's own estimate of a board's shape needs all corners in each view. held: only what
+    a few views determine is estimated, focal length, k1 and k2; the rest as of usual lenses.
     """
     fit = _fisheye(views, size) if fisheye else _pinhole(views, size, held)
     at, unit = _linearise(views, fit, fisheye), np.eye(len(fit.parameters))
-    flat = np.column_stack([unit[0] + unit[1], unit[4], unit[5]]) if held else unit[:, :-3]
-    bowed = np.column_stack([flat, unit[:, -3:]])
+    flat = np.column_stack([unit[0] + unit[1], unit[4], unit[5]]) if held else unit[:, :-_SHAPE]
+    # Beside a principal point that is taken for granted, its error would be a stretch.
+    bowed = np.column_stack([flat, unit[:, -_SHAPE:-1] if held else unit[:, -_SHAPE:]])
+    count = bowed.shape[1] - flat.shape[1]
     inverse = _inverse(bowed.T @ at.information @ bowed)
-    shape = (inverse @ bowed.T @ at.gradient)[-3:]
-    statistic = float(shape @ np.linalg.solve(inverse[-3:, -3:], shape)) / _noise(at, bowed)
-    if not statistic > _BOWED:
+    shape = (inverse @ bowed.T @ at.gradient)[-count:]
+    statistic = float(shape @ np.linalg.solve(inverse[-count:, -count:], shape)) / _noise(at, bowed)
+    if not statistic > _MISSHAPEN[count]:
         return fit, at, flat
     damping, before = 0.0, np.inf
     for _ in range(_MAX_ROUNDS):
@@ -220,12 +229,14 @@ def _flat(fit: list[Any], count: int) -> _Fit:
     matrix, distortions, rotations, translations = fit
     focal_and_centre = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     poses = [np.r_[np.ravel(turn), np.ravel(place)] for turn, place in zip(rotations, translations, strict=True)]
-    return _Fit(np.r_[focal_and_centre, np.ravel(distortions)[:count], np.zeros(3)], np.array(poses))
+    return _Fit(np.r_[focal_and_centre, np.ravel(distortions)[:count], np.zeros(_SHAPE)], np.array(poses))
 
 
 def _lens(fit: _Fit, size: tuple[int, int], fisheye: bool) -> Intrinsics:
     fx, fy, cx, cy = fit.parameters[:4]
-    return Intrinsics(*size, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), fit.parameters[4:-3], fisheye)
+    return Intrinsics(
+        *size, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), fit.parameters[4:-_SHAPE], fisheye
+    )
 
 
 def _linearise(views: list[BoardView], fit: _Fit, fisheye: bool) -> _Linearised:
@@ -238,8 +249,8 @@ def _linearise(views: list[BoardView], fit: _Fit, fisheye: bool) -> _Linearised:
     information, gradient = np.zeros((count, count)), np.zeros(count)
     residuals, jacobians = list[Floats](), list[tuple[Floats, Floats]]()
     for view, pose in zip(views, fit.poses, strict=True):
-        heights = _quadratic(view.points)
-        points = view.points + np.outer(heights @ fit.parameters[-3:], [0.0, 0.0, 1.0])
+        by_shape = _by_shape(view.points)
+        points = view.points + by_shape @ fit.parameters[-_SHAPE:]
         at = pose[:3], pose[3:], lens.matrix, lens.distortions
         if fisheye:
             seen, jacobian = cv2.fisheye.projectPoints(points[None], *at)
@@ -247,8 +258,8 @@ def _linearise(views: list[BoardView], fit: _Fit, fisheye: bool) -> _Linearised:
         else:
             seen, jacobian = cv2.projectPoints(points, *at)
             by_lens, by_pose = jacobian[:, 6:15], jacobian[:, :6]
-        by_height = by_pose[:, 3:] @ cv2.Rodrigues(pose[:3])[0][:, 2:]
-        by_parameters = np.column_stack([by_lens, by_height * np.repeat(heights, 2, axis=0)])
+        by_point = (by_pose[:, 3:] @ cv2.Rodrigues(pose[:3])[0]).reshape(-1, 2, 3)
+        by_parameters = np.column_stack([by_lens, (by_point @ by_shape).reshape(len(by_lens), _SHAPE)])
         residual = np.ravel(seen) - view.pixels.ravel()
         left = by_parameters - by_pose @ np.linalg.pinv(by_pose) @ by_parameters
         information += by_parameters.T @ left
@@ -285,10 +296,11 @@ def _view_rms(at: _Linearised) -> Floats:
     return np.array([np.sqrt(2.0 * np.mean(one**2)) for one in at.residuals])
 
 
-def _quadratic(points: Floats) -> Floats:
-    """(n, 3) of the board's points (n, 3): what each coefficient of a quadratic surface adds to their height."""
-    x, y = points[:, 0], points[:, 1]
-    return np.column_stack([x * x, x * y, y * y])
+def _by_shape(points: Floats) -> Floats:
+    """(n, 3, 4): how each parameter of the board's shape moves its points (n, 3)."""
+    (x, y), zero = points[:, :2].T, np.zeros(len(points))
+    rows = [zero] * 4, [zero, zero, zero, y], [x * x, x * y, y * y, zero]
+    return np.stack([np.column_stack(row) for row in rows], axis=1)
 
 
 def _corner_counts(views: list[BoardView], size: tuple[int, int]) -> Ints:

@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 from scipy.special import chdtri
 
-from hub.bundle.block_matrix import BlockSum
+from hub.bundle.block_matrix import BlockSum, ParameterCovariance
 from hub.bundle.covariance import constrained_step
 from hub.bundle.linearised_model import LinearisedModel, evidence_needed
 from hub.bundle.noise.correlated_noise import lens_tolerance
@@ -44,6 +44,8 @@ _FALSE_ALARM_PROBABILITY = 1e-4
 _READOUT_MARGIN = 0.25
 """Error of an estimated readout, in frame intervals, that is plausible: a global shutter's comes out at about 0."""
 _TESTED_AT_ONCE = 64  # cameras: of all, their columns would be as large as the matrix
+_TANGENTIAL_SHARE = 0.25
+"""Of what free principal points gain: a ninth of it at most in six mirrored rigs, all of it in others."""
 REFUTED_SIGMA = 4.0
 """Stds from which a rate is no crystal's: of a hundred cameras with crystals one in 160 is refuted."""
 LENS = (FOCAL, K1, CENTRE, CENTRE + 1)
@@ -72,17 +74,58 @@ def refuted_lenses(problem: Problem, state: AdjustmentState, *tested: tuple[int,
     effective sample size. What the linear model predicts of each has to come true: in a short or narrow motion it may
     predict any focal length.
     """
-    cameras = range(len(state.cameras))
-    given = [camera for camera in cameras if problem.lens_prior(camera) is None]
+    given = [camera for camera in range(len(state.cameras)) if problem.lens_prior(camera) is None]
     if not problem.free_parameters.pose or problem.free_parameters.lens or not given:
         return []
-    freed = replace(problem, lens_tolerances=tuple(map(_any_lens, problem.nominal)))
-    modelled = [modelled_inflation(problem, state, camera) for camera in cameras]
-    inflation = np.maximum(correlation_inflation(problem, state), modelled)
-    noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
-    linear = LinearisedModel.about(freed, noisy, estimate_smoothness(problem, state))
+    linear = _with_any_lens(problem, state)
     found = (_refuted_lenses(problem, linear, given, parameters) for parameters in tested)
     return next(filter(None, found), [])
+
+
+def mirrored_axis(problem: Problem, state: AdjustmentState) -> str:
+    """The pixel coordinate that every camera with a measured lens counts from the other side, "u" or "v"; "" if none.
+
+    problem, state: adjusted with these lenses fixed. Mirrored pictures fit a mirrored world, but for the principal
+    points, which are mirrored with them: these then have to fit instead, by as much as refutes the given ones, and as
+    well as free ones do, within what may be owed to the tangential distortions, which no parameter mirrors.
+    """
+    given = [camera for camera in range(len(state.cameras)) if problem.lens_prior(camera) is None]
+    linear = _with_any_lens(problem, state)
+    columns = linear.problem.free_columns
+    kept = np.flatnonzero(np.isin(columns, problem.free_columns))
+    own = np.flatnonzero(np.isin(columns, [i * CAMERA_PARAMETERS + CENTRE + axis for i in given for axis in (0, 1)]))
+
+    def best_step(free: Ints) -> tuple[Floats, ParameterCovariance]:
+        normal, fixed = linear.parts.reduced.restricted(free), linear.fixed[:, free]
+        return constrained_step(normal, -linear.gradient[free], fixed, np.zeros(len(fixed)))
+
+    step, covariance = best_step(kept)
+    coupling = linear.parts.reduced.columns(own)
+    left = linear.gradient[own] + coupling[kept].T @ step
+    with_centres = np.union1d(kept, own)
+    gained = float(linear.gradient[kept] @ step - linear.gradient[with_centres] @ best_step(with_centres)[0])
+    limit = float(chdtri(len(own), _FALSE_ALARM_PROBABILITY))
+    for axis, name in enumerate("uv"):
+        change = np.zeros((len(given), 2))
+        change[:, axis] = [
+            (problem.nominal[i].width, problem.nominal[i].height)[axis] - 1 - 2.0 * problem.nominal[i].matrix[axis, 2]
+            for i in given
+        ]
+        moved = change.ravel()
+        known = coupling[kept] @ moved
+        gain = float(known @ (covariance @ known) - 2.0 * left @ moved - moved @ coupling[own] @ moved)
+        if gain > limit and gained - gain < max(limit, _TANGENTIAL_SHARE * gained):
+            return name
+    return ""
+
+
+def _with_any_lens(problem: Problem, state: AdjustmentState) -> LinearisedModel:
+    """The model with all lenses free, its noise scaled to the effective sample size."""
+    freed = replace(problem, lens_tolerances=tuple(map(_any_lens, problem.nominal)))
+    modelled = [modelled_inflation(problem, state, camera) for camera in range(len(state.cameras))]
+    inflation = np.maximum(correlation_inflation(problem, state), modelled)
+    noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
+    return LinearisedModel.about(freed, noisy, estimate_smoothness(problem, state))
 
 
 def _refuted_lenses(

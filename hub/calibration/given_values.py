@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from hub.bundle.covariance import Covariance, eliminate_paths
-from hub.bundle.model_comparison import LENS, ScoreTest, refuted_lenses
+from hub.bundle.model_comparison import LENS, ScoreTest, mirrored_axis, refuted_lenses
 from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Sensitivity
 from protocols.session.rig import Rig
@@ -33,12 +34,20 @@ def refuted_lens(test: ScoreTest) -> str:
 def refuted_lens_warnings(
     names: list[str], problem: Problem, state: AdjustmentState, refine_lenses: bool = False
 ) -> tuple[str, ...]:
-    """One sentence for each measured lens that the observations refute; the answer keeps it as given."""
+    """One sentence for each measured lens that the observations refute; the answer keeps it as given.
+
+    Raises Refused where mirrored ones would fit: then the answer is a mirror image.
+    """
+    refuted = refuted_lenses(problem, state, LENS, LENS[:2])
+    if refuted and (axis := mirrored_axis(problem, state)):
+        side, size = ("right", "width") if axis == "u" else ("bottom", "height")
+        raise Refused(
+            f"every camera's picture is mirrored: the measured lenses are refuted, and fit with {axis} counted from "
+            f"the {side}; give {axis} from the other side, {size} - 1 - {axis}, as of the pictures that the lenses "
+            "were measured with"
+        )
     remedy = "correct it" if refine_lenses else "correct it, or estimate it with --refine-lenses"
-    return tuple(
-        f"{names[one.camera]}: {refuted_lens(one)}; it was kept as given: {remedy}"
-        for one in refuted_lenses(problem, state, LENS, LENS[:2])
-    )
+    return tuple(f"{names[one.camera]}: {refuted_lens(one)}; it was kept as given: {remedy}" for one in refuted)
 
 
 def sensitivities(

@@ -51,11 +51,13 @@ from hub.two_view.relative_pose import fundamental_from
 from protocols.core.acceptance import first_failure
 from protocols.core.errors import Refused
 from protocols.session.calibration import Calibration, FixedCalibration
+from protocols.session.folder import enlargements
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
 _LENS_ITERATIONS = 3  # a bound: it stops where no lens changes
 _SMALL_BODY = 4  # points of a single tag
+_FAR_BETTER = 0.5  # residuals of noise are the same in pictures of any size, and a wrong size's are 10 times as large
 
 
 def calibrate(
@@ -150,7 +152,7 @@ def calibrate(
         if not (moves := moves_of_two(solution.prepared, maps, observations, online)):
             report("covariances", 0.95)
             calibration = assemble_calibration(rig, solution, refine_lenses=refine_lenses, online=online)
-            check_stature(calibration.trajectories)
+            _check(calibration, rig, observations, again if may_move else None)
             return calibration
     except Refused as refusal:
         if may_move and (found := _between_settings(prepared.cameras, observations, again)):
@@ -194,6 +196,37 @@ def _from_still_parts(
             warnings = tuple(move.warning(name) for name, move in moves.items())
             return replace(found, warnings=(*found.warnings, *warnings))
     return None
+
+
+def _check(
+    found: Calibration, rig: Rig, observations: Observations, again: Callable[[Observations], Calibration] | None
+) -> None:
+    """Raise Refused where people change their height, and where rows in the upper left of all pictures place more
+    cameras, or fit far better, as those of smaller pictures. again: calibrates other rows; None = do not try that."""
+    check_stature(found.trajectories)
+    if again is None:
+        return
+    fits = [(len(found.cameras), -_median_rms(found), 1)]
+    for factor in enlargements(rig, observations):
+        tracks = {
+            key: replace(track, pixels=factor * (track.pixels + 0.5) - 0.5)
+            for key, track in observations.tracks.items()
+        }
+        with suppress(Refused):
+            enlarged = again(replace(observations, tracks=tracks))
+            fits.append((len(enlarged.cameras), -_median_rms(enlarged) / factor, factor))
+    cameras, fit, factor = max(fits)
+    if factor > 1 and (cameras > len(found.cameras) or -fit < _FAR_BETTER * _median_rms(found)):
+        raise Refused(
+            f"as those of pictures of 1/{factor} the size that rig.toml states, the rows place {cameras} cameras and "
+            f"fit to {-fit:.2g} px; as given, {len(found.cameras)} cameras and {_median_rms(found):.2g} px: correct "
+            "size and matrix, or scale u and v"
+        )
+
+
+def _median_rms(found: Calibration) -> float:
+    """Residuals of the median camera [px]."""
+    return float(np.median([camera.rms_px for camera in found.cameras.values()]))
 
 
 def _between_settings(

@@ -6,7 +6,8 @@ that cameras need not be synchronised and the std has the same meaning.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,10 +21,24 @@ from hub.calibration.result import trajectory_tables
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import Refused
+from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration, TrajectoryTable
 from protocols.session.observations import Observations
-from protocols.session.rig import Rig
+from protocols.session.rig import METRES_PER_UNIT, Rig
+
+_SOUND_M_S = 340.0  # at 1000 times its size, what walks, drives or flies is beyond it
+_CAMERA_AXES_UP = np.diag([1.0, -1.0, -1.0])
+_CONVENTIONS: dict[str, Callable[[Pose], Pose]] = {
+    "translation is the camera's place in the world": lambda pose: Pose(pose.rotation, pose.translation),
+    "rotation and translation are world from camera": lambda pose: Pose(pose.rotation.T, pose.translation),
+    "rotation is world from camera": lambda pose: Pose(pose.rotation.T, -pose.rotation @ pose.translation),
+    "cameras look along -z, with y up": lambda pose: Pose(_CAMERA_AXES_UP @ pose.rotation, pose.position),
+    "rotation and translation are world from camera, and cameras look along -z, with y up": lambda pose: Pose(
+        _CAMERA_AXES_UP @ pose.rotation.T, pose.translation
+    ),
+}
+"""What other tools write where ``rotation`` and ``translation`` are expected, and the pose that is meant."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,9 +62,29 @@ def triangulate(
 
     rig: of the calibration. known: its cameras. The std of a trajectory covers the noise of the observations, as
     estimated from the residuals, not the calibration's own errors. Raises Refused where there is no trajectory, or
-    where the rows contradict the calibration.
+    where the rows contradict the calibration; the reason names another convention of its poses in which they fit.
     """
     report = progress or (lambda text, share: None)
+    try:
+        return _triangulate(rig, known, observations, report)
+    except Refused as refusal:
+        for convention, pose_of in _CONVENTIONS.items():
+            others = {name: replace(camera, pose=pose_of(camera.pose)) for name, camera in known.items()}
+            with suppress(Refused):
+                fitting = _triangulate(rig, others, observations, report).sigma_px
+                if 2 * len(fitting) <= len(known):  # two may fit by chance
+                    continue
+                refusal.reason = (
+                    f"the rows fit {len(fitting)} cameras if in the calibration {convention}; give rotation and "
+                    "translation camera from world, as OpenCV and aniposelib have them"
+                )
+                break
+        raise
+
+
+def _triangulate(
+    rig: Rig, known: Mapping[str, CameraCalibration], observations: Observations, report: Progress
+) -> Triangulation:
     report("smoothing the tracks", 0.1)
     lenses = {name: replace(rig.cameras[name], intrinsics=camera.intrinsics) for name, camera in known.items()}
     prepared = prepare(replace(rig, cameras=lenses), observations)
@@ -80,7 +115,7 @@ def triangulate(
     if not any(len(table.time) for table in tables):
         raise Refused("no label is seen by two cameras within 0.2 s of each other", unused)
     sigmas = _sigmas(reconstruction)
-    warnings = list(prepared.warnings)
+    warnings = [*prepared.warnings, *_unlikely_speed(rig, tables)]
     for name, (sigma, calibrated_rms) in larger_residuals(reconstruction, known).items():
         warnings.append(f"{name}: residuals of {sigma:.1f} px, {calibrated_rms:.1f} px when it was calibrated")
     triangulated = {table.label for table in tables if len(table.time)}
@@ -91,6 +126,17 @@ def triangulate(
         tuple(label for label in observations.labels if label not in triangulated),
         tuple(warnings),
     )
+
+
+def _unlikely_speed(rig: Rig, tables: tuple[TrajectoryTable, ...]) -> tuple[str, ...]:
+    """A warning where what is triangulated moves faster than sound by the calibration's units."""
+    if rig.metadata.get("scale", "metric") != "metric":
+        return ()
+    speeds = [np.linalg.norm(np.diff(one.position, axis=0), axis=1) / np.diff(one.time) for one in tables]
+    typical = METRES_PER_UNIT[rig.units] * float(np.median(np.concatenate([np.zeros(1), *speeds])))
+    if typical < _SOUND_M_S:
+        return ()
+    return (f"it moves at {typical:.3g} m/s as a rule: the calibration's positions seem not to be in {rig.units}",)
 
 
 def _reconstruct(prepared: PreparedSession, known: Mapping[str, CameraCalibration], names: list[str]) -> Reconstruction:

@@ -79,3 +79,7 @@ class Refused(SynclineError):
         self.reason = printable(" ".join(reason.split()))
         self.cameras = dict(cameras or {})
         super().__init__(self.reason)
+
+    def __str__(self) -> str:
+        """The reason, as it may have been completed since."""
+        return self.reason

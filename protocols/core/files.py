@@ -124,6 +124,20 @@ def _check_integers(values: object) -> None:
             raise OverflowError
 
 
+def destination(file: Path) -> Path:
+    """The file that an output ``file`` leads to, through symbolic links. Raises InputError for a pipe or a device.
+
+    A renamed file would take the place of a link, and, for root, that of /dev/null or /dev/stdout.
+    """
+    try:
+        special = not (stat.S_ISREG(mode := file.stat().st_mode) or stat.S_ISDIR(mode))
+    except OSError:  # not there, or not to be looked at, which writing will say
+        special = False
+    if special:
+        raise InputError("is a device or a pipe, no file", file=file, remedy="give the name of a file")
+    return file.resolve() if file.is_symlink() else file
+
+
 def write_atomically(file: Path, text: str) -> None:
     """Write ``text`` (UTF-8) to ``file``: a reader sees the old file or the new one, never a part.
 
@@ -140,8 +154,9 @@ def write_together(files: Mapping[Path, str]) -> None:
     prepared: list[tuple[Path, Path]] = []
     now = Path()
     try:
-        for file, text in files.items():
-            now = file
+        for given, text in files.items():
+            now = given
+            file = destination(given)
             file.parent.mkdir(parents=True, exist_ok=True)
             if file.is_dir():
                 raise IsADirectoryError(errno.EISDIR, "this is a folder, but a file is needed")
@@ -191,6 +206,7 @@ def completed_file(file: Path, *, new: bool = False) -> Iterator[Path]:
     """
     if new and file.exists():
         raise InputError("exists already", file=file, remedy="choose another --out, or move it away")
+    file = destination(file)
     temporary = file.with_name(f".{file.stem}.{os.getpid()}{file.suffix}")
     temporary.unlink(missing_ok=True)
     try:

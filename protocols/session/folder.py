@@ -11,6 +11,7 @@ import tomli_w
 
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
+from protocols.geometry.types import Floats
 from protocols.session.calibration import csv_cell
 from protocols.session.observations import Observations, read_observations
 from protocols.session.rig import Rig, misspelt_keys, read_rig
@@ -21,7 +22,12 @@ _MANY_TIMES = 10  # distinct ones that are all whole by chance: of stamps in ten
 _MANY_ROWS, _SMALL_PICTURE = 100, 0.55
 """Rows of a camera, and the share of its width and of its height that they reach in every camera: those of pictures of
 half the size reach a half."""
-_MAX_OUTSIDE_SHARE = 0.01  # share of rows outside the image above which a warning is given
+_ENLARGEMENTS = (2, 3, 4)  # whole parts of a picture that detectors are given to save time
+_MAX_OUTSIDE_SHARE, _MAX_INSIDE_SHARE = 0.01, 0.02
+"""Share of rows outside the image above which a warning is given, and of these with u and v swapped, for false ones."""
+_MANY_OUTSIDE_SHARE, _LARGE_PICTURE = 0.1, 1.1
+"""Share of rows outside, and the share of width and of height that they reach, of no detector: people's joints are
+placed beyond one border, where people are cut."""
 
 
 def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Observations]:
@@ -42,31 +48,77 @@ def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Ob
 
 
 def column_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
-    """Warnings for cameras with many rows outside their image (a wrong size, or u and v swapped) or with times that are
-    frame numbers or milliseconds, and for pixels of smaller images."""
-    warnings, reach = [], list[float]()
+    """Warnings for cameras with many rows outside their image or with times that are frame numbers or milliseconds, and
+    for pixels of smaller images. Raises InputError for u and v swapped and for pixels of larger images."""
+    warnings = []
     for name, camera in rig.cameras.items():
-        pixels = np.concatenate([np.zeros((0, 2)), *(track.pixels for track in observations.of_camera(name))])
-        outside = int(((pixels < -1.0) | (pixels > np.array(camera.size))).any(axis=1).sum())
+        pixels = _pixels(observations, name)
+        outside = _outside(pixels, camera.size)
         if outside > _MAX_OUTSIDE_SHARE * len(pixels):
+            _check_axes(name, camera.size, pixels, outside)
             width, height = camera.size
             warnings.append(
                 f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image; check size, u, v"
             )
-        if len(pixels) >= _MANY_ROWS:
-            reach.append(float((np.quantile(pixels, 0.99, axis=0) / camera.size).max()))
         times = np.concatenate([np.zeros(0), *(track.time for track in observations.of_camera(name))])
         if camera.fps > 1.0 and len(np.unique(times)) >= _MANY_TIMES and (times == np.rint(times)).all():
             warnings.append(
                 f"{name}: all its times are whole numbers of seconds, though it films {camera.fps:g} frames a second; "
                 "frame numbers have to be divided by the frame rate, milliseconds by 1000"
             )
-    if len(reach) > 1 and max(reach) < _SMALL_PICTURE:
+    if enlargements(rig, observations):
         warnings.append(
-            f"every camera's rows lie in the upper left of its picture, within {max(reach):.2g} of its width and "
-            "height: were they detected in smaller pictures than rig.toml states, or given as fractions?"
+            f"every camera's rows lie in the upper left of its picture, within {_reach(rig, observations):.2g} of its "
+            "width and height: were they detected in smaller pictures than rig.toml states, or given as fractions?"
         )
     return tuple(warnings)
+
+
+def enlargements(rig: Rig, observations: Observations) -> tuple[int, ...]:
+    """Whole factors by which all pixels can be enlarged and stay in the images, where every camera's rows lie in the
+    upper left of its image, as those of pictures of half the size do; else none."""
+    reach = _reach(rig, observations)
+    return tuple(factor for factor in _ENLARGEMENTS if factor * reach < _SMALL_PICTURE * _ENLARGEMENTS[0])
+
+
+def _reach(rig: Rig, observations: Observations) -> float:
+    """The share of its width or height that the rows of any camera reach; 1 with less than two cameras of many rows."""
+    found = {name: _pixels(observations, name) for name in rig.cameras}
+    reach = [
+        float((np.quantile(pixels, 0.99, axis=0) / rig.cameras[name].size).max())
+        for name, pixels in found.items()
+        if len(pixels) >= _MANY_ROWS
+    ]
+    return max(reach) if len(reach) > 1 else 1.0
+
+
+def _pixels(observations: Observations, camera: str) -> Floats:
+    return np.concatenate([np.zeros((0, 2)), *(track.pixels for track in observations.of_camera(camera))])
+
+
+def _outside(pixels: Floats, size: tuple[int, int]) -> int:
+    """Number of pixels (n, 2) beyond the image."""
+    return int(((pixels < -1.0) | (pixels > np.array(size))).any(axis=1).sum())
+
+
+def _check_axes(name: str, size: tuple[int, int], pixels: Floats, outside: int) -> None:
+    """Raise InputError for pixels (n, 2) that fit the image with u and v swapped, and for those of a larger image."""
+    width, height = size
+    many = len(pixels) >= _MANY_ROWS
+    if many and _outside(pixels[:, ::-1], size) < _MAX_INSIDE_SHARE * outside:
+        raise InputError(
+            f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image, and none with u and v "
+            "swapped",
+            remedy="swap the columns u and v, or width and height in rig.toml's size",
+        )
+    if not many or outside <= _MANY_OUTSIDE_SHARE * len(pixels):
+        return
+    if (np.quantile(pixels, 0.99, axis=0) > _LARGE_PICTURE * np.array(size)).all():
+        raise InputError(
+            f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image, at the right and below: "
+            "they are pixels of a larger one",
+            remedy="correct size and matrix in rig.toml, or scale u and v",
+        )
 
 
 def write_rig(file: Path, tables: dict[str, Any]) -> None:

@@ -67,8 +67,9 @@ def follow(
         Rows a second [Hz]. Default: a row at each frame of the reference camera, or at each time of a shared clock.
     truth
         True positions, frame,person,x,y or time,person,x,y (any of them with z), in the calibration's world and units:
-        adds MODA, MOTA, IDF1 and HOTA to the results. Matches are within 0.5 m on the ground. Needs TrackEval: pip
-        install --no-deps trackeval
+        adds MODA, MOTA, IDF1 and HOTA to the results. Matches are within 0.5 m on the ground. A truth that fits the
+        tracks in other units, another world or at other times alone is refused. Needs TrackEval: pip install --no-deps
+        trackeval
     area
         With --truth: x0,x1,y0,y1, the part of the ground that was annotated; nothing outside counts.
     crops

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from deploy.commands.common import Flag, Json, UnusedSeed, answer, check_file, check_range, closing_lines, parse_size
 from deploy.offline.progress import progress_bar
-from protocols.core.errors import InputError
+from protocols.core.errors import InputError, Refused
 from protocols.core.names import check_name, name_from_file
 
 _MAX_FRAMES = 250  # most frames in which the board is searched
@@ -56,7 +56,7 @@ def intrinsics(
     board
         charuco: ChArUco board, which may be partly outside the image. chessboard: plain chessboard.
     squares
-        Number of squares, columns x rows, as printed: 8x5.
+        Number of squares, columns x rows, as printed, not of the corners between them: 8x5.
     dictionary
         Marker dictionary of a ChArUco board, by its OpenCV name: 4X4_50, 5X5_100, APRILTAG_36H11, …
     ratio
@@ -105,7 +105,11 @@ def intrinsics(
             for view in board_views(described, reader, step, reader.info.size[0]):
                 views.append(view)
                 progress(f"{len(views)} views, frame {view.frame}", min(view.frame / total, 1.0) if total else 0.0)
-        fit = calibrate_lens(views, reader.info.size, fisheye)
+        try:
+            fit = calibrate_lens(views, reader.info.size, fisheye)
+        except Refused as refusal:
+            refusal.reason = "; ".join((refusal.reason, *reader.warnings))
+            raise
         lens = fit.intrinsics
         if fit.views < MIN_VIEWS:
             guess_std = fit.focal_std
@@ -120,6 +124,7 @@ def intrinsics(
             "rms_px": fit.rms_px,
             "focal_std": fit.focal_std,
             "bow": fit.bow,
+            "stretch": fit.stretch,
             "coverage": fit.coverage,
             "cells": fit.cells.tolist(),
         }
@@ -134,10 +139,13 @@ def intrinsics(
         if guess_std:
             lines.append(f"approximate: fewer than {MIN_VIEWS} different views; `syncline calibrate` refines it")
         if fit.bow:
-            lines.append(f"the board is bowed by {fit.bow:.2g} of a square, which was allowed for")
+            shape = (
+                f"bowed by {fit.bow:.2g} of a square, its rows {100 * fit.stretch:+.2g} % farther apart than columns"
+            )
+            lines.append(f"the board is {shape}, which was allowed for")
         covered = f"corners in each part of the image ({100 * fit.coverage:.0f} %):"
         lines += [f"corners fit to {fit.rms_px:.3f} px; {covered}", *coverage_map(fit.cells)]
-    return answer(document, [*lines, *closing_lines((), [out])], json)
+    return answer(document | {"warnings": reader.warnings}, [*lines, *closing_lines(reader.warnings, [out])], json)
 
 
 def _completed(file: Path, name: str, table: dict[str, Any]) -> str:

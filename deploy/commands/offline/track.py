@@ -83,7 +83,8 @@ def track(
     overlay
         Also write overlay.mp4: particles, road and estimate on a canvas larger than the image.
     csv_truth
-        Ground truth CSV with frame,x,y[,width,height][,inside][,visible]: prints the track's scores.
+        Ground truth CSV with frame,x,y[,width,height][,inside][,visible], x, y the centre in pixels: prints the track's
+        scores.
     seed
         Seed of the tracker's random numbers.
     """

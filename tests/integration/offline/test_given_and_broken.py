@@ -564,6 +564,14 @@ def test_a_camera_whose_residuals_are_far_larger_than_the_others_is_named() -> N
     assert named == ["cam3"]
     session.pixels[mine] -= wander
     assert not any("times the others'" in text for text in calibrate(session.rig, session.observations()).warnings)
+    # In an image six times as large the same angles are six times the pixels.
+    camera = session.rig.cameras["cam3"]
+    assert camera.intrinsics is not None
+    scaled = np.diag([6.0, 6.0, 1.0]) @ camera.intrinsics.matrix
+    large = replace(camera.intrinsics, width=6 * camera.size[0], height=6 * camera.size[1], matrix=scaled)
+    session.pixels[mine] *= 6.0
+    rig = replace(session.rig, cameras=session.rig.cameras | {"cam3": replace(camera, intrinsics=large)})
+    assert not any("times the others'" in text for text in calibrate(rig, session.observations()).warnings)
 
 
 def test_of_two_references_that_explain_a_contradiction_alike_neither_is_blamed() -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
 import tomllib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,8 @@ from deploy.config.agents import HubConfig
 from deploy.config.file import load
 from hub.calibration.pipeline import calibrate
 from protocols.core.errors import InputError
-from protocols.core.files import write_together
+from protocols.core.files import completed_file, write_together
+from protocols.geometry.types import Floats
 from protocols.log.write.writer import LogWriter
 from protocols.session.folder import write_observations
 from protocols.session.observations import Observations
@@ -154,6 +155,31 @@ def test_one_file_that_cannot_be_written_leaves_none(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["second"]
 
 
+def test_an_output_goes_through_links_and_never_takes_the_place_of_a_device(tmp_path: Path) -> None:
+    """A renamed file takes the place of a link; root's took that of /dev/null."""
+    shared, link, pipe = tmp_path / "shared.csv", tmp_path / "link.csv", tmp_path / "pipe.csv"
+    shared.write_text("old")
+    link.symlink_to("shared.csv")
+    os.mkfifo(pipe)
+    write_together({link: "new"})
+    assert (link.is_symlink(), shared.read_text()) == (True, "new")
+    with completed_file(link) as part:
+        part.write_text("newer")
+    assert (link.is_symlink(), shared.read_text()) == (True, "newer")
+    with pytest.raises(InputError, match="is a device or a pipe"):
+        write_together({pipe: "new"})
+    with pytest.raises(InputError, match="is a device or a pipe"), completed_file(pipe):
+        pass
+    assert pipe.is_fifo()
+
+
+def test_an_interrupt_while_modules_are_imported_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "cyclopts.py").write_text("raise KeyboardInterrupt")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-m", "deploy"], env=environment, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (130, b"syncline: interrupted\n")
+
+
 @pytest.mark.parametrize("out", ["file", "file/below", "x" * 300, "locked", "locked/below"])
 def test_an_output_folder_that_cannot_be_is_told_before_the_work(
     filmed: Session, tmp_path: Path, out: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -185,16 +211,32 @@ def test_a_time_or_pixel_beyond_all_measure_is_bad_input(tmp_path: Path, row: st
     assert run(["calibrate", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
 
 
-def test_swapped_coordinates_are_warned_of(filmed: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    seen = filmed.observations()
-    tracks = {
-        key: type(t)(t.camera, t.label, t.frame, t.time, t.pixels[:, ::-1] * [1.0, 1.0], t.size)
-        for key, t in seen.tracks.items()
-    }
-    folder = write_session(tmp_path / "session", filmed, observations=Observations(tracks))
-    run(["calibrate", str(folder), "--out", str(tmp_path / "out")])
-    document = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert any("outside its" in text for text in document["warnings"])
+@pytest.mark.parametrize(
+    ("change", "status", "report"),
+    [
+        (lambda pixels: pixels[:, ::-1], 2, "swap the columns u and v"),
+        (lambda pixels: 1.5 * pixels, 2, "pixels of a larger one"),
+        (lambda pixels: 0.5 * pixels, 3, "pictures of 1/2 the size that rig.toml states, the rows place 4 cameras"),
+        (lambda pixels: pixels / 3, 3, "pictures of 1/3 the size"),
+        (lambda pixels: [1279, 0] - pixels * [1, -1], 3, "picture is mirrored: the measured lenses are refuted"),
+        (lambda pixels: [0, 719] - pixels * [-1, 1], 3, "give v from the other side, height - 1 - v"),
+    ],
+)
+def test_pixels_of_another_convention_are_named(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[Floats], Floats],
+    status: int,
+    report: str,
+) -> None:
+    """All these gave an answer, of another world or a mirrored one, with warnings at most."""
+    session = simulate(3, 4, 30.0)
+    folder = write_session(tmp_path / "session", session)
+    seen = session.observations()
+    tracks = {key: replace(track, pixels=change(track.pixels)) for key, track in seen.tracks.items()}
+    write_observations(folder / "observations.csv", Observations(tracks))
+    assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == status
+    assert report in capsys.readouterr().err
 
 
 def test_the_demo_takes_its_agents_along_when_it_is_ended(tmp_path: Path) -> None:

@@ -131,6 +131,15 @@ def test_few_views_or_none_are_refused(tmp_path: Path, capsys: Capture) -> None:
     assert "in no frame" in capsys.readouterr().err
 
 
+def test_images_of_other_sizes_are_named(tmp_path: Path, capsys: Capture) -> None:
+    """They were left out without a word; where the first one was the odd one, the board was "seen in 1 view"."""
+    video = render_board(tmp_path / "mixed", "charuco", False, count=10)
+    first = video / "000.bmp"
+    cv2.imwrite(str(first), cv2.resize(cv2.imread(str(first)), (320, 240)))
+    assert run(command(video, tmp_path / "rig.toml", "charuco")) == 3
+    assert "9 frames are not of the first one's size, 320x240" in capsys.readouterr().err
+
+
 def test_a_fisheye_taken_for_a_pinhole_is_refused(tmp_path: Path, capsys: Capture) -> None:
     video = render_board(tmp_path / "wide", "charuco", True, reach=1.2)
     assert run(command(video, tmp_path / "rig.toml", "charuco")) == 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,12 @@ import pytest
 import tomli_w
 
 from deploy.cli import run
+from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
 Capture = pytest.CaptureFixture[str]
+
+UP = np.diag([1.0, -1.0, -1.0])  # axes of a camera with y up, looking along -z
 
 
 @pytest.fixture(scope="module")
@@ -156,4 +160,54 @@ def test_a_calibration_that_contradicts_the_rows_is_refused(
     out = tmp_path / "track.csv"
     assert run(["triangulate", str(two), "--calibration", str(known), "--out", str(out)]) == 3
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert not out.exists()
+
+
+def test_millimetres_where_metres_are_stated_are_warned_of(session: Path, tmp_path: Path, capsys: Capture) -> None:
+    tables = tomllib.loads((session / "truth_calibration.toml").read_text())
+    for factor in (1.0, 1000.0):
+        for name, table in tables.items():
+            if name != "metadata":
+                table["translation"] = [factor * value for value in table["translation"]]
+                table.pop("position", None)
+        (tmp_path / "known.toml").write_text(tomli_w.dumps(tables))
+        known, out = str(tmp_path / "known.toml"), tmp_path / "track.csv"
+        assert run(["triangulate", str(session), "--calibration", known, "--out", str(out)]) == 0
+        assert ("positions seem not to be in m" in capsys.readouterr().out) == (factor > 1.0)
+
+
+@pytest.mark.parametrize(
+    ("written", "report"),
+    [
+        (lambda r, t: (r, -r.T @ t), "translation is the camera's place in the world"),
+        (lambda r, t: (r.T, -r.T @ t), "rotation and translation are world from camera"),
+        (lambda r, t: (r.T, t), "rotation is world from camera"),
+        (lambda r, t: (UP @ r, UP @ t), "cameras look along -z, with y up"),
+        (
+            lambda r, t: ((UP @ r).T, -r.T @ t),
+            "rotation and translation are world from camera, and cameras look along -z, with y up",
+        ),
+    ],
+)
+def test_another_convention_of_poses_is_named(
+    session: Path,
+    tmp_path: Path,
+    capsys: Capture,
+    written: Callable[[Floats, Floats], tuple[Floats, Floats]],
+    report: str,
+) -> None:
+    """It was said that a camera had been moved, or that nothing was seen by two."""
+    tables = tomllib.loads((session / "truth_calibration.toml").read_text())
+    tables["metadata"].pop("up", None)
+    turn, shift = so3.exp(np.array([0.3, -0.8, 0.5])), np.array([1.0, 2.0, 3.0])  # so that no camera is the world
+    for name, table in tables.items():
+        if name != "metadata":
+            rotation = so3.exp(np.array(table["rotation"]))
+            matrix, place = written(rotation @ turn, np.array(table["translation"]) + rotation @ shift)
+            table.update(rotation=so3.log(matrix).tolist(), translation=place.tolist())
+            table.pop("position", None)
+    (tmp_path / "known.toml").write_text(tomli_w.dumps(tables))
+    known, out = str(tmp_path / "known.toml"), tmp_path / "track.csv"
+    assert run(["triangulate", str(session), "--calibration", known, "--out", str(out)]) == 3
+    assert f"if in the calibration {report};" in capsys.readouterr().err
     assert not out.exists()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from deploy.demo.people import PeopleComparison
 from deploy.evaluation.clear_mot import EvaluationFrame, clear_mot
 
 
@@ -55,3 +58,13 @@ def test_no_targets_and_no_estimates() -> None:
     scores = clear_mot([moment({}, {})], 0.5)
     assert scores.truths == 0
     assert np.isnan(scores.error)
+
+
+@pytest.mark.parametrize(("frames", "said"), [(100, True), (295, False)])
+def test_the_demo_says_that_the_machine_is_too_slow_for_it(
+    frames: int, said: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A busy machine searched 3 of 10 frames a second, and the demo said no more than "NOT within the limits"."""
+    poor = clear_mot([EvaluationFrame(("a",), np.zeros((1, 2)), ("x",), np.ones((1, 2)))], 0.5)
+    PeopleComparison(poor, poor, poor, 30.0, 1, {"cam0": 299, "cam1": frames}, 10.0).print(Path("out"))
+    assert ("3.3 of 10 frames a second" in capsys.readouterr().out) == said

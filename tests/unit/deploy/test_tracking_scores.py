@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,10 @@ import numpy as np
 import pytest
 
 from deploy.evaluation.clear_mot import EvaluationFrame, clear_mot
-from deploy.evaluation.tracking_scores import GroundTruth, parse_area, read_ground_truth, score_tracks
+from deploy.evaluation.track_scores import score
+from deploy.evaluation.tracking_scores import GroundTruth, other_frame, parse_area, read_ground_truth, score_tracks
+from deploy.offline.track import TrackedFrame
+from edge.uav.base import Estimate, TrackState
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 
@@ -81,6 +85,67 @@ def test_tracks_are_interpolated_to_the_truth_and_not_across_gaps() -> None:
     scores = score_tracks(truth, [track], times.tolist(), 1.0)
     assert scores["misses"] == 6  # 2.75 to 5.25 s: farther than half a step from both ends of the gap
     assert scores["false"] == 0
+
+
+@pytest.mark.parametrize(
+    ("time", "x", "y", "words"),
+    [
+        (0.0, (1000.0, 0.0, 0.0), (0.0, 1000.0, 0.0), "times 0.001;"),
+        (0.0, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), "with the sign of y changed, turned by 90 degrees;"),
+        (0.0, (0.0, -1.0, 3.0), (1.0, 0.0, 0.0), "turned by -90 degrees, shifted by "),
+        (2.0, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), "2.0 s earlier;"),
+    ],
+)
+def test_a_truth_in_another_world_unit_or_time_is_named(
+    time: float, x: tuple[float, ...], y: tuple[float, ...], words: str
+) -> None:
+    """All of them were scored, down to a MODA of -1."""
+    _, _, times = walk(0)
+    when = times / times[-1]
+    paths = [np.column_stack([4.0 * np.sin(5.0 * when + k), (k - 1.5) * 4.0 * when + k * when**2]) for k in range(4)]
+    tracks = [Track(k, times, np.column_stack([paths[k], np.zeros(len(times))])) for k in range(4)]
+    rows = np.column_stack([np.concatenate(paths), np.ones(4 * len(times))])
+    truth = GroundTruth(np.tile(times + time, 4), np.repeat(np.arange(4), len(times)), rows @ np.array([x, y]).T)
+    with pytest.raises(InputError) as caught:
+        score_tracks(truth, tracks, times.tolist(), 1.0)
+    assert words in str(caught.value)
+
+
+def test_poor_tracks_are_no_other_frame() -> None:
+    truth, _, times = walk(1)
+    others, tracks, _ = walk(2)
+    assert score_tracks(truth, tracks, times.tolist(), 1.0)["misses"]
+    assert other_frame(others, tracks[:2], times.tolist(), 1.0) == ""
+
+
+@pytest.mark.parametrize(
+    ("written", "words"),
+    [
+        (lambda x, y: (x - 30.0, y - 20.0), "x, y are the top left corner;"),
+        (lambda x, y: (y, x), "x and y are swapped;"),
+        (lambda x, y: (x / 640.0, y / 480.0), "x, y are fractions of width and height;"),
+        (lambda x, y: (x, 479.0 - y), "y counts from the bottom;"),
+        (lambda x, y: (3.0 * x, 3.0 * y), "pixels are of pictures 3 times as large;"),
+    ],
+)
+def test_the_truth_of_an_image_track_in_another_convention_is_named(
+    written: Callable[[float, float], tuple[float, float]], words: str
+) -> None:
+    """All of them were scored as a track that is never near its target."""
+    places = [(100.0 + 8.0 * k, 300.0 - 4.0 * k + 0.1 * k * k) for k in range(40)]
+    rows = [
+        TrackedFrame(k, k / 30.0, Estimate(k / 30.0, TrackState.VISIBLE, x, y, 60.0, 40.0, 0.0, 1.0))
+        for k, (x, y) in enumerate(places)
+    ]
+    absent = dict.fromkeys(("width", "height", "inside", "visible"), np.nan)
+    truth = {k: absent | dict(zip("xy", places[k], strict=True)) for k in range(40)}
+    assert score(rows, truth, (640, 480))["in_frame_20px"] == 1.0
+    truth = {k: absent | dict(zip("xy", written(*places[k]), strict=True)) for k in range(40)}
+    with pytest.raises(InputError) as caught:
+        score(rows, truth, (640, 480))
+    assert words in str(caught.value)
+    lost = {k: absent | {"x": x + 100.0, "y": y} for k, (x, y) in enumerate(places)}
+    assert score(rows, lost, (640, 480))["in_frame_20px"] == 0.0
 
 
 def test_nothing_counts_outside_the_area() -> None:

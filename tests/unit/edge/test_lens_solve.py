@@ -16,9 +16,10 @@ CORNERS = np.array([[x, y, 0.0] for y in range(1, boards.SQUARES[1]) for x in ra
 
 
 def seen(
-    seed: int, count: int, tilt: float, fisheye: bool = False, bow: float = 0.0
+    seed: int, count: int, tilt: float, fisheye: bool = False, bow: float = 0.0, stretch: float = 0.0
 ) -> tuple[Intrinsics, list[BoardView]]:
-    """A lens and ``count`` views with 0.15 px of noise, tilted by up to ``tilt`` [rad], of a board bowed by ``bow``."""
+    """A lens and ``count`` views with 0.15 px of noise, tilted by up to ``tilt`` [rad], of a board bowed by ``bow``,
+    whose rows are farther apart by ``stretch``."""
     rng = np.random.default_rng([seed, 9])
     focal = SIZE[0] * (rng.uniform(0.28, 0.38) if fisheye else rng.uniform(0.6, 1.1))
     place = 0.5 * (np.array(SIZE) - 1.0) + rng.normal(0.0, 0.012 * SIZE[0], 2)
@@ -27,6 +28,7 @@ def seen(
     lens, views = Intrinsics(*SIZE, matrix, np.array(bend), fisheye), []
     reach = 0.75 if fisheye else 0.35 * SIZE[0] / focal
     board = CORNERS - [4.0, 3.0, 0.0]
+    board[:, 1] *= 1.0 + stretch
     board[:, 2] -= bow * (board[:, 0] / 3.0) ** 2
     for turn, centre in boards.board_poses(count, seed, tilt, reach):
         pixels = lens.project(board @ turn.T + centre * focal / 550.0)
@@ -73,4 +75,15 @@ def test_a_bowed_board_is_told_and_its_focal_length_as_good_as_a_flat_ones(count
         scores.append(np.log(found.intrinsics.focal / lens.focal) / found.focal_std)
         assert found.bow == pytest.approx(0.05, abs=0.015)
         assert calibrate_lens(seen(seed, count, 0.6, fisheye)[1], SIZE, fisheye).bow == 0.0
+    assert np.sqrt(np.mean(np.square(scores))) < 1.8
+
+
+@pytest.mark.parametrize(("count", "fisheye"), [(24, False), (16, True)])
+def test_a_board_that_a_printer_stretched_costs_no_focal_length(count: int, fisheye: bool) -> None:
+    scores = []
+    for seed in range(6):
+        lens, views = seen(seed, count, 0.6, fisheye, stretch=0.02)
+        found = calibrate_lens(views, SIZE, fisheye)
+        scores.append(np.log(found.intrinsics.focal / lens.focal) / found.focal_std)
+        assert found.stretch == pytest.approx(0.02, abs=0.005)
     assert np.sqrt(np.mean(np.square(scores))) < 1.8
