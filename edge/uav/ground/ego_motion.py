@@ -221,7 +221,7 @@ class EgoMotion:
             pose: PlanePose | PlaneHomography = _solve_pose(guess, ground, normalised, unit, std, absolute)
         else:
             pose = _solve_pose(guess, ground, normalised, unit, std, (None, None))
-        error = np.linalg.norm(apply_homography(pose.matrix, ground) - normalised, axis=1) / unit
+        error = np.hypot(*(apply_homography(pose.matrix, ground) - normalised).T) / unit
         good, inliers = np.zeros(len(at), bool), np.zeros(len(at), bool)
         good[followed] = error < _MAX_RESIDUAL
         inliers[followed] = error < min(max(4.0 * median(error), 0.5), _MAX_RESIDUAL)

@@ -151,10 +151,10 @@ class TelemetryTrack:
         if len(self._visual_times) < 2 or too_soon:
             return
         times = np.array(self._visual_times)
-        camera_times = sample_time - self._offsets
-        if camera_times.min() < times[0] or camera_times.max() > times[-1]:
+        camera_times = sample_time - self._offsets  # descending
+        if camera_times[-1] < times[0] or camera_times[0] > times[-1]:
             return
-        first = int(np.searchsorted(times, camera_times.min())) - 1
+        first = int(np.searchsorted(times, camera_times[-1])) - 1
         visual = np.array([self._visual[i] for i in range(max(first, 0), len(times))])
         times = times[max(first, 0) :]
         index = np.clip(np.searchsorted(times, camera_times) - 1, 0, len(times) - 2)
