@@ -367,7 +367,9 @@ class LiveHub:
             reason = self.links.slow.get(name) or waiting.get(name, refused.get(name, ""))
             rows, least = self.stream.marker.rows(name), self.settings.least_rows
             state = "searching" if rows >= least else "collecting"
-            if state == "collecting" and not reason:
+            if not self.stream.has_info(name):
+                reason = "no CameraInfo yet: it holds the image size and the lens"
+            elif state == "collecting" and not reason:
                 reason = f"{rows} of {least} detections"
             if name in tied:
                 silent = self._now - self.links.last_frame.get(name, self._now) > SILENT_S

@@ -66,6 +66,15 @@ def test_times_in_another_unit_than_nanoseconds_are_named(period_ns: int, told: 
     assert "nanoseconds" not in hub.state(900 * 0.033)[1]
 
 
+def test_a_camera_that_has_not_introduced_itself_is_told_so() -> None:
+    hub = LiveHub(LiveSettings(track=False))
+    hub.handle(info("a"))
+    for number in range(100):
+        for camera in ("a", "b"):
+            hub.handle(frame(camera, number), number * 0.033)
+    assert ["CameraInfo" in one.reason for one in hub.progress()] == [False, True]
+
+
 def test_a_burst_after_an_outage_is_no_wrong_unit() -> None:
     hub = LiveHub(LiveSettings(track=False))
     for number in range(2000):
