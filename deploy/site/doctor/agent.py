@@ -185,10 +185,11 @@ def access_rights(bus: BusConfig, site: str, role: str, agent: str, seconds: flo
     return ok("access rules", f"{agent} receives no messages of others")
 
 
-def others(bus: BusConfig, site: str, role: str, agent: str) -> CheckResult:
-    """Which agents of the site can be seen: a name in use twice, and a site that has no hub while another has."""
+def others(bus: BusConfig, site: str, role: str) -> CheckResult:
+    """Which agents of the site can be seen: a name in use twice, hubs that do not share it, a site without a hub."""
     from protocols.bus.base import BusDead
     from protocols.bus.router.probe import agents_alive
+    from protocols.bus.security.sender_identity import SenderValidator
 
     config = _as_client(bus)
     if config is None:
@@ -199,22 +200,20 @@ def others(bus: BusConfig, site: str, role: str, agent: str) -> CheckResult:
         sites = agents_alive(config)
     except (InputError, BusDead) as error:
         return skip("agents", f"not tried: {getattr(error, 'what', error)}")
-    here, own = sites.get(site, []), (CERTIFICATE_ROLES.get(role, role), agent)
-    if here.count(own) > 1:
-        return warn(
-            "agents",
-            f"{role} {agent} runs {here.count(own)} times: only the first is heard",
-            "give each an id of its own, or stop the one that is not wanted",
-        )
-    elsewhere = [name for name, agents in sites.items() if name != site and any(one == "hub" for one, _ in agents)]
-    if elsewhere and not any(one == "hub" for one, _ in here):
+    guard, here = SenderValidator(), sites.get(site, [])
+    for one in here:
+        guard.handle(one)
+    if alarms := guard.alarms():
+        return warn("agents", "; ".join(alarms), "then run this again")
+    elsewhere = [name for name, agents in sites.items() if name != site and any(one.role == "hub" for one in agents)]
+    if elsewhere and not any(one.role == "hub" for one in here):
         named = ", ".join(f'"{name}"' for name in elsewhere[:4])
         return warn(
             "agents",
             f'no hub of site "{site}" runs here, but one of site {named}: agents hear only their own site',
             f'site = "{elsewhere[0]}" in the file, if this is an agent of it; otherwise start a hub',
         )
-    named = ", ".join(f"{one} {name}" for one, name in dict.fromkeys(here) if one in _SHOWN_ROLES)
+    named = ", ".join(sorted(f"{one.role} {one.agent}" for one in here if one.role in _SHOWN_ROLES))
     return ok("agents", f"site {site}: {named or 'nobody yet'}")
 
 
