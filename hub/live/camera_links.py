@@ -37,11 +37,11 @@ class CameraLinks:
         self.fresh: set[str] = set()
         self.faults: Counter[str] = Counter()
         self.notices: dict[str, str] = {}
-        self.slow: dict[str, str] = {}
-        """By camera, what is wrong with times that hardly advance."""
+        self.standing: dict[str, str] = {}
+        """By camera, what is wrong with times that hardly advance, or numbers that do not."""
         self._muted: dict[str, str] = {}
-        self._windows: dict[str, tuple[int, float, float]] = {}
-        """Frames, first arrival [s] and the camera's time then [s]."""
+        self._windows: dict[str, tuple[int, float, pb.Observation]] = {}
+        """Frames, first arrival [s] and the frame that arrived then."""
 
     def receive(self, message: pb.Observation, now: float, arrival: float | None, *, backlog: bool) -> None:
         """Note a frame; arguments as of ``LiveHub.handle``."""
@@ -54,23 +54,28 @@ class CameraLinks:
         self.last_frame[camera] = now
 
     def compare_rates(self, message: pb.Observation, arrival: float | None) -> None:
-        """Note a frame, also one that is left out, to find times that hardly advance. arrival: as of ``receive``."""
+        """Note a frame, also one that is left out, to find times and numbers that do not advance. arrival: as of ``receive``."""
         if arrival is None:
             return
         camera, camera_time = message.camera, message.device_time_ns / NANOSECONDS
-        frames, began, first = self._windows.get(camera, (0, arrival, camera_time))
+        frames, began, first = self._windows.get(camera, (0, arrival, message))
+        if first.boot_id != message.boot_id:
+            frames, began, first = 0, arrival, message
         self._windows[camera] = frames + 1, began, first
         if frames < _RATE_FRAMES or arrival - began < _RATE_S:
             return
         del self._windows[camera]
-        rate = (camera_time - first) / (arrival - began)
+        rate = (camera_time - first.device_time_ns / NANOSECONDS) / (arrival - began)
+        self.standing.pop(camera, None)
         if 0.0 <= rate < _LEAST_RATE:
-            self.slow[camera] = (
+            self.standing[camera] = (
                 f"the times of {camera} advance by {rate:.2g} s a second: device_time_ns must be in nanoseconds, "
                 "and that of each frame"
             )
-        else:
-            self.slow.pop(camera, None)
+        elif message.sequence == first.sequence:
+            self.standing[camera] = (
+                f"the frames of {camera} all have sequence {first.sequence}: it must count them, from 0"
+            )
 
     def ages(self, now: float, kept: Iterable[str]) -> dict[str, float]:
         """Seconds since the last frame of each camera of ``kept`` or heard of lately."""

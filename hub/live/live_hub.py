@@ -351,7 +351,7 @@ class LiveHub:
             out.append(f"frames left out of {listed(exceeding)}: more than a camera may send")
         if self._schedule.left_out:
             out.append(f"{self._schedule.left_out} is left out: the solver failed with its rows")
-        out += [*self.links.notices.values(), *self.links.slow.values()][:8]
+        out += [*self.links.notices.values(), *self.links.standing.values()][:8]
         if self.solver.busy and now - self._submitted_at > _BEHIND_S:
             out.append(f"the solver is behind: {now - self._submitted_at:.0f} s for one job")
         return out + [text for text in (self.solver_failure, self.notice) if text]
@@ -364,7 +364,7 @@ class LiveHub:
         out = []
         shared = self.stream.marker.shared_motions_s()
         for name in self.stream.marker.cameras:
-            reason = self.links.slow.get(name) or waiting.get(name, refused.get(name, ""))
+            reason = self.links.standing.get(name) or waiting.get(name, refused.get(name, ""))
             rows, least = self.stream.marker.rows(name), self.settings.least_rows
             state = "searching" if rows >= least else "collecting"
             if not self.stream.has_info(name):

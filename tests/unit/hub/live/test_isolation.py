@@ -66,6 +66,17 @@ def test_times_in_another_unit_than_nanoseconds_are_named(period_ns: int, told: 
     assert "nanoseconds" not in hub.state(900 * 0.033)[1]
 
 
+def test_frames_that_are_not_counted_are_named() -> None:
+    """All but one were left out as duplicates: "too few connected observations (1 rows)"."""
+    hub = LiveHub(LiveSettings(track=False))
+    for number in range(200):
+        hub.handle(frame("a", number), number * 0.033)
+        hub.handle(frame("b", number, sequence=0), number * 0.033)
+    (text,) = hub.links.standing.values()
+    assert text == "the frames of b all have sequence 0: it must count them, from 0"
+    assert text in hub.state(200 * 0.033)[1]
+
+
 def test_a_camera_that_has_not_introduced_itself_is_told_so() -> None:
     hub = LiveHub(LiveSettings(track=False))
     hub.handle(info("a"))
@@ -79,7 +90,7 @@ def test_a_burst_after_an_outage_is_no_wrong_unit() -> None:
     hub = LiveHub(LiveSettings(track=False))
     for number in range(2000):
         hub.handle(frame("a", number), max(number * 0.033, 40.0 * (number > 20)))
-        assert not hub.links.slow
+        assert not hub.links.standing
 
 
 def test_a_clock_that_hardly_advances_fills_no_window() -> None:
