@@ -54,7 +54,7 @@ class CameraLinks:
         self.last_frame[camera] = now
 
     def compare_rates(self, message: pb.Observation, arrival: float | None) -> None:
-        """Note a frame, also one that is left out, to find times and numbers that do not advance. arrival: as of ``receive``."""
+        """Note a frame, also one left out, to find times and numbers that stand still. arrival: as of ``receive``."""
         if arrival is None:
             return
         camera, camera_time = message.camera, message.device_time_ns / NANOSECONDS
