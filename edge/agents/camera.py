@@ -235,7 +235,10 @@ class CameraAgent:
             gauges["heard"] = float(out_queue.has_subscriber(OBSERVATION))
         if gauges.get("heard") == 0.0 and not text:
             # A put that the router's access rules deny raises no error.
-            text = "no subscriber: no hub is running, or the router's access rules do not let this camera publish"
+            text = (
+                "no subscriber: no hub of this camera's site is running, or the router's access rules do not let this "
+                "camera publish"
+            )
         recent = self._recent.copy()
         if len(recent) > 1:
             span = (recent[-1][0] - recent[0][0]) / NANOSECONDS

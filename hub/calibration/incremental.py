@@ -56,6 +56,7 @@ from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
+_WAITS = "waits for the next search of its lag"
 _BETTER_KNOWN = 0.7  # a clock step is refined where its std falls below this share: twice the rows
 
 
@@ -145,8 +146,12 @@ def update_calibration(
             found_clocks = _clocks_from_pairs(pairs, placed, prepared)
             clocks |= {name: clock for name, clock in found_clocks.items() if name in prepared.cameras}
             reasons |= {name: describe_failures(name, pairs) for name in unknown if name not in clocks}
-    refused, waits = dict(prepared.refused), "waits for the next search of its lag"
-    reasons = {name: reasons.get(name) or refused.get(name, waits) for name in new if name not in clocks}
+    refused = dict(prepared.refused)
+    reasons = {
+        name: reasons.get(name) or refused.get(name) or _waits(last.refused.get(name, ""))
+        for name in new
+        if name not in clocks
+    }
     if len(clocks) > len(placed) or moved:
         reconstruction, unplaced = place_cameras(
             prepared.cameras,
@@ -181,6 +186,12 @@ def update_calibration(
     kept = {name: camera for name, camera in last.cameras.items() if name not in found.cameras and name not in refuted}
     refused = {name: reason for name, reason in found.refused.items() if name not in kept}
     return Update(replace(found, cameras=found.cameras | kept, refused=refused), moved)
+
+
+def _waits(before: str) -> str:
+    """Why a camera is not calibrated between two searches of its lag: also why it was not before."""
+    found_none = before.removeprefix(_WAITS).removeprefix("; before: ")
+    return f"{_WAITS}; before: {found_none}" if found_none else _WAITS
 
 
 def _from_newest_side(

@@ -32,6 +32,9 @@ from hub.clocks.delay_changepoint import (
 
 MIN_STEP_S = 0.2
 """Smaller steps cannot be distinguished from late frames [s]."""
+_STEP_SIGMAS = 5.0  # of what the frame numbers predict, whose period jitters: one in a million by chance
+_USUAL_BINS = 8
+"""4 s, of which the median is the usual delay: a frame from before a pause, in a bin of its own, does not change it"""
 _SCREENING_SIGMAS = 2.0
 """Excess delay, in usual deviations from the line, from which the changepoint test is made at all"""
 _BIN_S = 0.5  # s: the smallest delay of each counts
@@ -159,7 +162,7 @@ class ClockChangeDetector:
     ) -> ClockChange | None:
         if clock.last is None:
             return None
-        _, last_frame, last_time, last_arrival = clock.last
+        _, last_frame, last_time, _ = clock.last
         elapsed, frames = time - last_time, frame - last_frame
         if frames > 0 and 0.0 < elapsed < MIN_STEP_S + 1.0 and len(clock.periods) < 5:
             clock.periods.append(elapsed / frames)
@@ -176,19 +179,34 @@ class ClockChangeDetector:
         period = clock.period
         step = elapsed - frames * period
         if abs(step) > MIN_STEP_S:
-            arrival_gap = None if arrival is None or last_arrival is None else arrival - last_arrival
-            # A camera that stalled without counting frames: both clocks have advanced.
-            if elapsed > 0.0 and arrival_gap is not None and abs(elapsed - arrival_gap) < MIN_STEP_S:
+            spread = max(1.5 * float(np.median(np.abs(np.array(clock.periods) - period))), 1e-4)
+            # The error of the period, which is a median, grows with every frame that is missing.
+            std = spread * math.hypot(math.sqrt(frames), frames * math.sqrt(0.5 * math.pi / len(clock.periods)))
+            if abs(step) < _STEP_SIGMAS * std or self._has_usual_delay(clock, time, arrival):
                 return None
-            spread = float(np.median(np.abs(np.array(clock.periods) - period))) * 1.5
             earlier = list(clock.bins)[-1 - _MAX_PRESTEP_BINS : -1] if arrival is not None else []
-            change = self._start_segment(clock, camera, "step", sequence, step, max(spread, 1e-4) * np.sqrt(frames))
+            change = self._start_segment(clock, camera, "step", sequence, step, std)
             if len(earlier) >= _MIN_PRESTEP_BINS:
                 level, slope, sigma = fit_line(np.array(earlier))
                 clock.refinement = StepEstimator(len(self._changes), step, change.step_std_s, (level, slope), sigma)
             return change
         clock.periods.append(elapsed / frames)
         return None
+
+    @staticmethod
+    def _has_usual_delay(clock: _ClockState, time: float, arrival: float | None) -> bool:
+        """Whether both clocks have advanced: of a camera that stalled without counting frames, for one.
+
+        By the last frame, and by the frames before that: of a machine that was suspended the last frame arrived late.
+        """
+        assert clock.last is not None
+        _, _, last_time, last_arrival = clock.last
+        if arrival is None or last_arrival is None or time <= last_time:
+            return False
+        usual = [last_arrival - last_time]
+        if clock.bins:
+            usual.append(float(np.median([delay for _, delay in list(clock.bins)[-_USUAL_BINS:]])))
+        return min(abs(arrival - time - delay) for delay in usual) < MIN_STEP_S
 
     def _add_delay(self, clock: _ClockState, time: float, arrival: float) -> bool:
         """Add one delay; True when a bin is complete."""

@@ -91,6 +91,10 @@ class ObservationStream:
             self._extend_old_segment(message, now)
         return message
 
+    def has_info(self, camera: str) -> bool:
+        """Whether a camera has introduced itself: without its image size it is not calibrated."""
+        return camera in self._infos
+
     def arrivals(self, boots: Mapping[str, str]) -> dict[str, ExternalClockPrior]:
         """Clock priors by times of arrival, of the clocks with the given boot ids."""
         return {name: prior for name, prior in self._arrivals.priors().items() if prior.boot_id == boots.get(name)}

@@ -62,22 +62,25 @@ class ClockSegments:
 
         boots: segments of the maps that are given. until: segments to stop at, by camera.
         t_old = t_new - step - rate_change * (t_new - detected_at), from the time of detection on; the variance of the
-        step is added to the offset's.
+        step is added to the offset's and to the lag's.
         """
         cameras, names = dict(calibration.cameras), dict(boots)
         for name, camera in calibration.cameras.items():
             rate, offset = camera.time_map.clock_rate, camera.time_map.time_offset
-            std, lag_time = camera.time_offset_std, camera.lag_time
+            stds, lag_time = (camera.time_offset_std, camera.lag_std), camera.lag_time
             for change in self._detector.changes_since(name, boots.get(name, "")):
                 if until is not None and names.get(name) == until.get(name):
                     break
                 offset -= rate * (change.step_s - change.rate_change * change.detected_at_s)
                 rate *= 1.0 - change.rate_change
-                std, lag_time = math.hypot(std, change.step_std_s), lag_time + change.step_s
+                lag_time += change.step_s
+                stds = math.hypot(stds[0], change.step_std_s), math.hypot(stds[1], change.step_std_s)
                 names[name] = change.segment
             if names.get(name) != boots.get(name):
                 time_map = TimeMap(time_offset=offset, clock_rate=rate)
-                cameras[name] = replace(camera, time_map=time_map, time_offset_std=std, lag_time=lag_time)
+                cameras[name] = replace(
+                    camera, time_map=time_map, time_offset_std=stds[0], lag_time=lag_time, lag_std=stds[1]
+                )
         return replace(calibration, cameras=cameras), names
 
     def change_into(self, segment: str) -> ClockChange | None:

@@ -12,6 +12,12 @@ from protocols.messages import syncline_pb2 as pb
 
 _FORGOTTEN_S = 600.0
 """A camera that is not calibrated is not waited for after this time without a frame."""
+_RATE_FRAMES, _RATE_S = 100, 5.0
+"""Frames, and seconds of arrivals, over which a camera's times are compared with the hub's: an outage and the burst
+after it are shorter in frames"""
+_LEAST_RATE = 0.01
+"""Of a camera's clock against the hub's: times in microseconds for nanoseconds have a thousandth. A log may be replayed
+as fast as one likes, but not a hundred times slower."""
 _MAX_FAULTS = 3
 """Errors that a camera's messages may raise before they are not used any more, until its agent is restarted."""
 
@@ -31,7 +37,11 @@ class CameraLinks:
         self.fresh: set[str] = set()
         self.faults: Counter[str] = Counter()
         self.notices: dict[str, str] = {}
+        self.standing: dict[str, str] = {}
+        """By camera, what is wrong with times that hardly advance, or numbers that do not."""
         self._muted: dict[str, str] = {}
+        self._windows: dict[str, tuple[int, float, pb.Observation]] = {}
+        """Frames, first arrival [s] and the frame that arrived then."""
 
     def receive(self, message: pb.Observation, now: float, arrival: float | None, *, backlog: bool) -> None:
         """Note a frame; arguments as of ``LiveHub.handle``."""
@@ -42,6 +52,30 @@ class CameraLinks:
                 self.fresh.add(camera)
             self.delays[camera] = arrival - camera_time
         self.last_frame[camera] = now
+
+    def compare_rates(self, message: pb.Observation, arrival: float | None) -> None:
+        """Note a frame, also one left out, to find times and numbers that stand still. arrival: as of ``receive``."""
+        if arrival is None:
+            return
+        camera, camera_time = message.camera, message.device_time_ns / NANOSECONDS
+        frames, began, first = self._windows.get(camera, (0, arrival, message))
+        if first.boot_id != message.boot_id:
+            frames, began, first = 0, arrival, message
+        self._windows[camera] = frames + 1, began, first
+        if frames < _RATE_FRAMES or arrival - began < _RATE_S:
+            return
+        del self._windows[camera]
+        rate = (camera_time - first.device_time_ns / NANOSECONDS) / (arrival - began)
+        self.standing.pop(camera, None)
+        if 0.0 <= rate < _LEAST_RATE:
+            self.standing[camera] = (
+                f"the times of {camera} advance by {rate:.2g} s a second: device_time_ns must be in nanoseconds, "
+                "and that of each frame"
+            )
+        elif message.sequence == first.sequence:
+            self.standing[camera] = (
+                f"the frames of {camera} all have sequence {first.sequence}: it must count them, from 0"
+            )
 
     def ages(self, now: float, kept: Iterable[str]) -> dict[str, float]:
         """Seconds since the last frame of each camera of ``kept`` or heard of lately."""

@@ -148,6 +148,8 @@ class LiveHub:
         if isinstance(message, pb.Observation | pb.CameraInfo) and self.links.is_left_out(message):
             return
         if isinstance(message, pb.Observation):
+            if not backlog and self.budgets.admits_camera(message.camera):
+                self.links.compare_rates(message, arrival)
             admitted = self.budgets.admit(message, self._now)
             if admitted is None:
                 room = self.budgets.admits_camera(message.camera)
@@ -315,16 +317,15 @@ class LiveHub:
 
     def state(self, now: float) -> tuple[HubState, str]:
         """What the hub does at ``now``, and one line for a person."""
+        reasons = self.degradations(now)
         if self.calibration is not None:
-            reasons = self.degradations(now)
             count = f"{len(self.calibration.cameras)} cameras calibrated"
             return ("degraded", "; ".join([*reasons, count])) if reasons else ("calibrated", count)
-        missing = "; ".join([*self.degradations(now), text]) if (text := self.missing()) else ""
-        if missing:
-            return "collecting", missing
-        if self.refusal is not None and self.refusal.permanent:
-            return "refused", self.refusal.reason
-        return "searching", "comparing all lags" if self.refusal is None else self.refusal.reason
+        if missing := self.missing():
+            return "collecting", "; ".join([*reasons, missing])
+        text = "comparing all lags" if self.refusal is None else self.refusal.reason
+        permanent = self.refusal is not None and self.refusal.permanent
+        return "refused" if permanent else "searching", "; ".join([*reasons, text])
 
     def frame_ages(self, now: float) -> dict[str, float]:
         """Seconds since the last frame of each camera that is calibrated or was heard of lately."""
@@ -350,7 +351,7 @@ class LiveHub:
             out.append(f"frames left out of {listed(exceeding)}: more than a camera may send")
         if self._schedule.left_out:
             out.append(f"{self._schedule.left_out} is left out: the solver failed with its rows")
-        out += [*self.links.notices.values()][:8]
+        out += [*self.links.notices.values(), *self.links.standing.values()][:8]
         if self.solver.busy and now - self._submitted_at > _BEHIND_S:
             out.append(f"the solver is behind: {now - self._submitted_at:.0f} s for one job")
         return out + [text for text in (self.solver_failure, self.notice) if text]
@@ -363,10 +364,12 @@ class LiveHub:
         out = []
         shared = self.stream.marker.shared_motions_s()
         for name in self.stream.marker.cameras:
-            reason = waiting.get(name, refused.get(name, ""))
+            reason = self.links.standing.get(name) or waiting.get(name, refused.get(name, ""))
             rows, least = self.stream.marker.rows(name), self.settings.least_rows
             state = "searching" if rows >= least else "collecting"
-            if state == "collecting" and not reason:
+            if not self.stream.has_info(name):
+                reason = "no CameraInfo yet: it holds the image size and the lens"
+            elif state == "collecting" and not reason:
                 reason = f"{rows} of {least} detections"
             if name in tied:
                 silent = self._now - self.links.last_frame.get(name, self._now) > SILENT_S

@@ -67,7 +67,9 @@ def test_of_two_agents_with_one_id_the_first_is_accepted(site: Site) -> None:
         lambda: site.subscription.drain() is None or site.subscription.counters.get("rejected.second_agent") == 20
     )
     assert {item.message.boot_id for item in received} == {"boot-1"}  # type: ignore[attr-defined]
-    assert site.receiving.guard.alarms() == ["camera cam0 runs 2 times; only the first is heard"]
+    assert site.receiving.guard.alarms() == [
+        "camera cam0 runs 2 times; only the first is heard: give each an id of its own"
+    ]
     measured("two agents with one id", "alarm, refused, counted", f"alarm after {alarm_delay:.2f} s, 20 of 20 refused")
 
 

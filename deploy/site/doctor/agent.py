@@ -19,6 +19,7 @@ from protocols.core.names import key_segment
 _SMALL, _LARGE = 1024, 1_000_000  # sizes of test messages [bytes]
 _EXPIRES_SOON_DAYS = 7.0  # a week, in which somebody looks
 _SUBSCRIBES_TO_ALL = ("hub", "recorder", "uav")
+_SHOWN_ROLES = ("camera", "hub", "record", "router", "uav", "view")
 CERTIFICATE_ROLES = {"recorder": "record"}
 
 
@@ -182,6 +183,38 @@ def access_rights(bus: BusConfig, site: str, role: str, agent: str, seconds: flo
     except (InputError, BusDead) as error:
         return skip("access rules", f"not tried: {getattr(error, 'what', error)}")
     return ok("access rules", f"{agent} receives no messages of others")
+
+
+def others(bus: BusConfig, site: str, role: str) -> CheckResult:
+    """Which agents of the site can be seen: a name in use twice, hubs that do not share it, a site without a hub."""
+    from protocols.bus.base import BusDead
+    from protocols.bus.router.probe import agents_alive
+    from protocols.bus.security.sender_identity import SenderValidator
+
+    config = _as_client(bus)
+    if config is None:
+        return skip("agents", "a peer that waits for others: nothing to connect to")
+    if bus.tls is not None and role not in _SUBSCRIBES_TO_ALL:
+        return skip("agents", "this certificate may not see others")
+    try:
+        sites = agents_alive(config)
+    except (InputError, BusDead) as error:
+        return skip("agents", f"not tried: {getattr(error, 'what', error)}")
+    guard, here = SenderValidator(), sites.get(site, [])
+    for one in here:
+        guard.handle(one)
+    if alarms := guard.alarms():
+        return warn("agents", "; ".join(alarms), "then run this again")
+    elsewhere = [name for name, agents in sites.items() if name != site and any(one.role == "hub" for one in agents)]
+    if elsewhere and not any(one.role == "hub" for one in here):
+        named = ", ".join(f'"{name}"' for name in elsewhere[:4])
+        return warn(
+            "agents",
+            f'no hub of site "{site}" runs here, but one of site {named}: agents hear only their own site',
+            f'site = "{elsewhere[0]}" in the file, if this is an agent of it; otherwise start a hub',
+        )
+    named = ", ".join(sorted(f"{one.role} {one.agent}" for one in here if one.role in _SHOWN_ROLES))
+    return ok("agents", f"site {site}: {named or 'nobody yet'}")
 
 
 def configuration(file: Path, role: str) -> tuple[CheckResult, Any]:

@@ -41,6 +41,7 @@ def run_checks(file: Path | None, role: str | None = None) -> Iterator[CheckResu
     yield from _one("certificates", lambda: agents.certificates(config.bus, kind, config.id))
     yield from _one("bus", lambda: agents.bus_path(config.bus, config.site, kind, config.id))
     yield from _one("access rules", lambda: agents.access_rights(config.bus, config.site, kind, config.id))
+    yield from _one("agents", lambda: agents.others(config.bus, config.site, kind))
     if kind == "uav":
         yield from _all("mavlink", lambda: autopilot.check(config))
     yield from _one("health", lambda: network.running_agent(config))

@@ -8,8 +8,10 @@ import uuid
 
 import zenoh
 
+from protocols.bus.base import AgentEvent
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
+from protocols.core.names import name_of_segment
 
 _FIRST_RETRY_S = 0.2  # doubled each time
 
@@ -51,6 +53,24 @@ def round_trip(config: BusConfig, prefix: str, size: int = 0, timeout_s: float =
         for session in sessions:
             close_session(session)
     return max(arrived - sent, 0.0) if arrived_event.is_set() else None
+
+
+def agents_alive(config: BusConfig, timeout_s: float = 2.0) -> dict[str, list[AgentEvent]]:
+    """Every run of an agent that announces itself, by site; what access rules hide is missing.
+
+    Raises InputError where no session can be opened, BusDead.
+    """
+    found: dict[str, list[AgentEvent]] = {}
+    session = open_session(config, timeout_s=timeout_s)
+    try:
+        with zenoh_call("probe"):
+            for reply in session.liveliness().get("syncline/*/alive/*/*/*", timeout=timeout_s):
+                if reply.ok is not None:
+                    _, site, _, role, agent, boot = str(reply.ok.key_expr).split("/")
+                    found.setdefault(site, []).append(AgentEvent(role, name_of_segment(agent) or agent, boot, True))
+    finally:
+        close_session(session)
+    return dict(sorted(found.items()))
 
 
 def count_received(config: BusConfig, expression: str, seconds: float, own: str = "\0") -> int:

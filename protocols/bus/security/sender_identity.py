@@ -32,6 +32,7 @@ _MAX_SOURCES = _MAX_AGENTS = 4 * MAX_CAMERAS  # of a hub: invented names cannot 
 _MAX_HEARD = 16
 """Boots of one agent whose late messages are accepted, and that may be alive at once."""
 _PUBLISHED_SOURCES = 48  # of rejections in a status, whose counters are bounded
+_SHARING = ("nodes", "shard")  # roles of hubs that calibrate one site together
 _MAX_COUNTER_NAME = 64  # characters: the validation's limit
 
 
@@ -86,12 +87,19 @@ class SenderValidator:
         return None
 
     def alarms(self) -> list[str]:
-        """Conditions that need an operator: ids that are in use twice."""
-        return [
-            f"{role} {name} runs {len(agent.alive)} times; only the first is heard"
-            for (role, name), agent in sorted(self._agents.items())
-            if len(agent.alive) > 1
+        """Conditions that need an operator: ids that are in use twice, and hubs that do not know of each other."""
+        alive = sorted(who for who, agent in self._agents.items() if agent.alive)
+        out = [
+            f"{role} {name} runs {len(self._agents[role, name].alive)} times; only the first is heard: "
+            "give each an id of its own"
+            for role, name in alive
+            if len(self._agents[role, name].alive) > 1
         ]
+        hubs = [name for role, name in alive if role == "hub" and not any((one, name) in alive for one in _SHARING)]
+        if len(hubs) > 1:
+            named = ", ".join(hubs[:8])
+            out.append(f"hubs {named} each publish a calibration, in worlds of their own: stop all but one")
+        return out
 
 
 def _role(received: Received) -> str:

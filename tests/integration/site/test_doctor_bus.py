@@ -6,7 +6,7 @@ import shutil
 import socket
 import threading
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -19,6 +19,7 @@ from protocols.bus.transport.session import open_session
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION, STATUS
+from tests.support.samples import eventually
 
 pytest.importorskip("cryptography", reason="the extra `keys` is not installed: access rules are not tested")
 from deploy.site.keys import issue, make_site
@@ -39,6 +40,28 @@ def test_no_router() -> None:
     found = agent.bus_path(BusConfig(mode="client", connect=(free_endpoint(),)), SITE, "camera", "cam0")
     assert (found.verdict, found.exit_status) == ("fail", 3)
     assert "start one there" in found.remedy
+
+
+def test_a_name_in_use_twice_and_a_site_without_a_hub_are_warned_of() -> None:
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with (
+        Router(endpoint),
+        open_bus("lab", config, timeout_s=5.0) as lab,
+        open_bus("yard", config) as yard,
+        ExitStack() as up,
+    ):
+        up.enter_context(lab.announce("hub", "hub", "boot-1"))
+        up.enter_context(yard.announce("camera", "cam é", "boot-2"))
+        eventually(lambda: len(probe.agents_alive(config)) == 2)
+        found = agent.others(config, "yard", "camera")
+        assert found.verdict == "warn"
+        assert 'no hub of site "yard" runs here, but one of site "lab"' in found.text
+        assert 'site = "lab"' in found.remedy
+        assert agent.others(config, "lab", "camera").text == "site lab: hub hub"
+        up.enter_context(lab.announce("hub", "hub", "boot-3"))
+        eventually(lambda: agent.others(config, "lab", "hub").verdict == "warn")
+        assert "runs 2 times" in agent.others(config, "lab", "hub").text
 
 
 def through_a_link(endpoint: str, change: Callable[[bytes], bytes]) -> str:

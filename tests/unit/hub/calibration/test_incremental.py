@@ -90,6 +90,28 @@ def test_a_late_camera_joins_by_resection_within_its_arrival_bound() -> None:
     assert abs(float(camera.time_map.reference_from_camera(CameraTime(camera.lag_time))) - truth) < 2e-3
 
 
+def test_between_two_searches_a_camera_keeps_the_reason_of_the_last() -> None:
+    """The page said of a camera whose pixels are in another unit that it waits, for ever."""
+    session = simulate(11, 4, 30)
+    rows = until(session, 30.0)
+    scaled = {
+        key: replace(track, pixels=track.pixels / 1000.0) if key[0] == "cam3" else track
+        for key, track in rows.tracks.items()
+    }
+    rows = replace(rows, tracks=scaled)
+    first = update_calibration(session.rig, without(until(session, 20.0), "cam3"), None).calibration
+    waiting = update_calibration(session.rig, rows, first, full=False, search=False).calibration
+    assert waiting.refused == {"cam3": "waits for the next search of its lag; before: no observations"}
+    searched = update_calibration(session.rig, rows, waiting, full=True).calibration
+    reason = searched.refused["cam3"]
+    for found in (
+        searched,
+        replace(searched, refused={"cam3": f"waits for the next search of its lag; before: {reason}"}),
+    ):
+        again = update_calibration(session.rig, rows, found, full=False, search=False).calibration
+        assert again.refused == {"cam3": f"waits for the next search of its lag; before: {reason}"}
+
+
 def test_a_late_camera_without_a_lens_joins_and_has_it_estimated() -> None:
     session = simulate(11, 4, 45)
     true = session.rig.cameras["cam3"]

@@ -60,6 +60,32 @@ def test_dropped_frames_and_a_stall_are_not_steps() -> None:
     assert camera.events == []
 
 
+@pytest.mark.parametrize("counts_frames", [False, True])
+def test_a_machine_that_was_suspended_is_not_a_step(counts_frames: bool) -> None:
+    """A frame from before the pause arrives with those after it, on a clock that went on; its device counts or not."""
+    camera = Camera()
+    camera.frames(100)
+    camera.number, camera.now_ns, camera.arrival = camera.number + 1, camera.now_ns + PERIOD_NS, camera.arrival + 30.0
+    camera.feed()
+    camera.now_ns += 30_000_000_000 - PERIOD_NS
+    camera.number += counts_frames * 890  # of 899: the rate of its last frames was not quite that of the pause
+    camera.frames(100)
+    assert camera.events == []
+    camera.frames(60, step_ns=10_000_000_000)
+    assert [event.step_s for event in camera.events] == pytest.approx([10.0], abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_many_missing_frames_of_jittered_stamps_are_not_a_step(seed: int) -> None:
+    """Without times of arrival, as of a log: what the period is known to must do for 30 s of it."""
+    rng, detector, events = np.random.default_rng(seed), ClockChangeDetector(), list[ClockChange]()
+    for number in [*range(150), *range(1050, 1200)]:
+        shown = number / 30.0 + float(rng.normal(0.0, 5e-3))
+        _, event = detector.handle("cam0", "b", number, number, round(shown * 1e9), None)
+        events += [] if event is None else [event]
+    assert events == []
+
+
 def test_consecutive_steps_are_detected() -> None:
     camera = Camera()
     camera.frames(60)
@@ -237,6 +263,7 @@ def test_a_time_map_follows_a_rate_change_from_its_detection(ppm: float) -> None
         off = now.time_map.clock_rate * (origin + shown(true)) + now.time_map.time_offset - true
         assert abs(off) < 1e-3
     assert now.time_offset_std > 1e-4
+    assert now.lag_std > 1e-4  # the one that is published
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

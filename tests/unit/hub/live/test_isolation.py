@@ -45,6 +45,54 @@ def info(camera: str) -> pb.CameraInfo:
     return pb.CameraInfo(schema_version=1, camera=camera, boot_id="b0", width=640, height=480, fps=30.0)
 
 
+@pytest.mark.parametrize(
+    ("period_ns", "told"), [(33_000_000, ""), (33_000, "0.001 s a second"), (33, "1e-06"), (0, "by 0 s")]
+)
+def test_times_in_another_unit_than_nanoseconds_are_named(period_ns: int, told: str) -> None:
+    """A camera of another maker whose times are microseconds waited for the next search of its lag for ever."""
+    hub = LiveHub(LiveSettings(track=False))
+    for camera in ("a", "b"):
+        hub.handle(info(camera))
+    for number in range(450):
+        hub.handle(frame("a", number), number * 0.033)
+        hub.handle(frame("b", number, period_ns=period_ns), number * 0.033)
+        hub.tick(number * 0.033)
+    text, reasons = hub.state(450 * 0.033)[1], {one.camera: one.reason for one in hub.progress()}
+    assert ("nanoseconds" in text, "nanoseconds" in reasons["b"]) == (bool(told), bool(told))
+    assert told in text
+    assert "times of a" not in text
+    for number in range(450, 900):  # its program is corrected
+        hub.handle(frame("b", number, boot_id="b1"), number * 0.033)
+    assert "nanoseconds" not in hub.state(900 * 0.033)[1]
+
+
+def test_frames_that_are_not_counted_are_named() -> None:
+    """All but one were left out as duplicates: "too few connected observations (1 rows)"."""
+    hub = LiveHub(LiveSettings(track=False))
+    for number in range(200):
+        hub.handle(frame("a", number), number * 0.033)
+        hub.handle(frame("b", number, sequence=0), number * 0.033)
+    (text,) = hub.links.standing.values()
+    assert text == "the frames of b all have sequence 0: it must count them, from 0"
+    assert text in hub.state(200 * 0.033)[1]
+
+
+def test_a_camera_that_has_not_introduced_itself_is_told_so() -> None:
+    hub = LiveHub(LiveSettings(track=False))
+    hub.handle(info("a"))
+    for number in range(100):
+        for camera in ("a", "b"):
+            hub.handle(frame(camera, number), number * 0.033)
+    assert ["CameraInfo" in one.reason for one in hub.progress()] == [False, True]
+
+
+def test_a_burst_after_an_outage_is_no_wrong_unit() -> None:
+    hub = LiveHub(LiveSettings(track=False))
+    for number in range(2000):
+        hub.handle(frame("a", number), max(number * 0.033, 40.0 * (number > 20)))
+        assert not hub.links.standing
+
+
 def test_a_clock_that_hardly_advances_fills_no_window() -> None:
     """4,096 labelled detections a frame on a clock that crawled by 1 ns took 2.5 GB: the window was on that clock."""
     budgets = CameraBudgets()

@@ -39,6 +39,19 @@ def test_the_first_of_two_is_heard_until_it_is_gone() -> None:
     assert guard.alarms() == []
 
 
+def test_two_hubs_of_one_site_are_an_alarm_unless_they_share_it() -> None:
+    guard = SenderValidator()
+    guard.handle(AgentEvent("hub", "one", "boot-1", True))
+    assert guard.alarms() == []
+    guard.handle(AgentEvent("hub", "two", "boot-2", True))
+    assert guard.alarms() == ["hubs one, two each publish a calibration, in worlds of their own: stop all but one"]
+    guard.handle(AgentEvent("shard", "two", "boot-2", True))
+    assert guard.alarms() == []
+    guard.handle(AgentEvent("shard", "two", "boot-2", False))
+    guard.handle(AgentEvent("hub", "one", "boot-1", False))
+    assert guard.alarms() == []
+
+
 def test_a_run_that_nobody_announced_is_refused_while_its_agent_lives() -> None:
     guard = SenderValidator()
     guard.handle(alive("boot-1"))
