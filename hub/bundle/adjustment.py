@@ -69,15 +69,13 @@ def adjust(
 ) -> tuple[Problem, AdjustmentState, SmoothnessPrior]:
     """Solve: robust rounds first, then the inliers with full weight.
 
-    rounds: 0 = near the solution, the rows in use are kept.
     coarse: leave out the last, fine round, for an initial estimate that is adjusted again.
     Returns the problem with inliers marked, the state, and the motion prior used.
     """
     # One path's prior recovers from a weak start in two rounds. Those of people's keypoints, whose strengths differ by
     # orders of magnitude, do not: steps and readouts were invented from what the rounds after them gained.
-    alone = len(state.trajectories) == 1
-    prior = estimate_smoothness(problem, state, weak=coarse or rounds > 2 or (rounds > 0 and alone))
-    robust = rounds > 0
+    prior = estimate_smoothness(problem, state, weak=coarse or rounds > 2 or len(state.trajectories) == 1)
+    robust = True
     steps = list(state.steps)
     for round_index in range(rounds):
         last = round_index == rounds - 1

@@ -165,7 +165,7 @@ def final_adjustment(
     refit = _refit_online if online else refit_with_correlated_noise
     refitted = refit(problem, state, refine_lenses)
     if refitted[1] is state and any(problem.crystal_rates):
-        refitted = adjust(problem, state, rounds=0, iterations=9)[:2]  # the re-fit would have applied the rates' prior
+        refitted = adjust(problem, state, rounds=1, iterations=9)[:2]  # the re-fit would have applied the rates' prior
     return replace(reconstruction, problem=refitted[0], state=refitted[1])
 
 

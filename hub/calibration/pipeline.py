@@ -390,6 +390,7 @@ def solve_network(
     free_parameters = FreeParameters(clock=not prepared.shared_clock)
     graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
     unfit, failures = set[str](), CameraTests()
+    with_rate_prior = replace(free_parameters, rate_std=_rate_prior_std(graph, free_parameters.rate_std))
     placed: dict[str, CameraState] = {}
     while True:
         unplaced: Mapping[str, str]
@@ -398,11 +399,14 @@ def solve_network(
         else:
             session = prepared.cameras, graph, prepared.rows, prepared.labels
             reconstruction, unplaced = (
-                place_cameras(*session, placed, free_parameters)
+                place_cameras(*session, placed, with_rate_prior)
                 if placed.keys() == graph.clocks.keys()
-                else reconstruct_incrementally(*session, lambda text: report(text, 0.6), free_parameters)
+                else reconstruct_incrementally(*session, lambda text: report(text, 0.6), with_rate_prior)
             )
             reconstruction = final(reconstruction, warm=bool(placed) and not (online or refine_lenses))
+            # The narrow rate prior only stabilises the estimate; stds are computed with the usual one.
+            usual = replace(reconstruction.problem.free_parameters, rate_std=free_parameters.rate_std)
+            reconstruction.problem = replace(reconstruction.problem, free_parameters=usual)
         refused |= unplaced
         tests: CameraTests = {}
         guesses = [n for n, one in prepared.cameras.items() if one.lens_prior and not one.lens_prior.focal_only]
@@ -454,6 +458,19 @@ def _misfit(reconstruction: Reconstruction, name: str) -> str:
     if failure is None or failure[0] == name:
         return "" if failure is None else failure[1].reason
     return f"with it {failure[0]} fails: {failure[1].reason}"
+
+
+def _rate_prior_std(graph: ClockGraph, usual: float) -> float:
+    """Prior std of clock rates: narrow for an isolated pair whose epipolar geometry did not determine the rate.
+
+    The trajectory would not determine it either, and a rate error of thousands of ppm would shift the lag.
+    """
+    stds = [
+        pair.fit.rate_prior_std
+        for pair in graph.inlier_pairs
+        if pair.fit is not None and np.isfinite(pair.fit.total_lag_std)
+    ]
+    return min([usual, *stds])
 
 
 def solve_paper(

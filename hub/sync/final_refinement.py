@@ -80,6 +80,7 @@ def refine_and_test(
         log10_false_alarm=fit.log10_false_alarm,
         lag_std=float(np.sqrt(max(covariance[-2, -2], 0.0))),
         rotation_std=float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0))) if has_pose else 0.0,
+        rate_prior_std=rate_prior_std,
     )
     speeds = np.hypot(*samples.interpolate_b((samples.time - last.offset) / rate)[1].T)
     speed = median(speeds[np.isfinite(speeds)])

@@ -56,6 +56,8 @@ class PairFit:
     """Largest std of the relative rotation in the final refinement, by noise alone [rad]."""
     total_lag_std: float = float("nan")
     """Std of the lag with lens and readout uncertainty included (consider covariance) [s]; nan where not computed."""
+    rate_prior_std: float = float("nan")
+    """Std of the rate prior in the final refinement; narrow where the motion does not determine the rate."""
 
     @property
     def pose(self) -> RelativePose:

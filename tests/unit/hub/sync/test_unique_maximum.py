@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hub.bundle.preprocessing import PreparedSession, prepare
+from hub.calibration import pipeline as solver
 from hub.calibration.pipeline import calibrate
 from hub.sync import final_refinement, pair_solver
 from hub.sync.acceptance import accept_or_reject, is_unique_maximum
@@ -172,3 +173,13 @@ def test_an_unobservable_rate_stays_near_a_crystals_in_a_two_camera_adjustment(s
     made, _, _ = tracks(seed)
     a, b = (calibrate(made.rig, made.observations).cameras[name].time_map.clock_rate for name in NAMES)
     assert 1e6 * abs(b / a - 1.0) < 400.0
+
+
+def test_the_rate_prior_of_a_pair_is_not_used_as_an_observation() -> None:
+    made, prepared, both = tracks(7065)
+    found = pair_solver.solve_pair(both["a"], both["b"], NAMES, SETTINGS)
+    assert found.fit is not None
+    assert found.fit.rate_prior_std < 1e-3
+    solution = solver.solve_network(prepare(made.rig, made.observations), [found], lambda text, share: None)
+    assert solution.reconstruction.problem.free_parameters.rate_std == 1e-3
+    assert prepared.time_origins == solution.prepared.time_origins
