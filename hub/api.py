@@ -201,6 +201,7 @@ def calibrate(
     two cameras.
     """
     from hub.calibration.pipeline import calibrate as estimate_calibration
+    from hub.calibration.triangulation import meant_convention, unlikely_speed
 
     options = options or CalibrationOptions()
     if options.from_known is not None and options.solver != "joint":
@@ -214,9 +215,10 @@ def calibrate(
         known, rig = _fixed(Path(options.from_known), session.rig)
         session = replace(session, rig=rig)
     began = time.process_time()
-    session = _with_associated_people(session, progress, known)
-    try:
-        found = estimate_calibration(
+    read, session = session, _with_associated_people(session, progress, known)
+
+    def estimated(session: Session, known: FixedCalibration | None) -> Calibration:
+        return estimate_calibration(
             session.rig,
             session.observations,
             progress,
@@ -227,11 +229,25 @@ def calibrate(
             refine_lenses=options.refine_lenses,
             clock_priors=session.clock_priors if isinstance(session, RecordedSession) else None,
         )
+
+    try:
+        found = estimated(session, known)
     except Refused as refused:
+        if known is not None:
+            scale = known.scale
+
+            def fitting(cameras: dict[str, CameraCalibration]) -> int:
+                other = FixedCalibration(cameras, scale)
+                return len(estimated(_with_associated_people(read, progress, other), other).cameras)
+
+            refused.reason = meant_convention(known.cameras, fitting) or refused.reason
         refused.warnings = (*session.warnings, *refused.warnings)
         refused.cpu_seconds = time.process_time() - began
         raise
     spent = time.process_time() - began
+    if known is not None:
+        speed = unlikely_speed(found.scale, found.units, found.trajectories)
+        found = replace(found, warnings=(*found.warnings, *speed))
     return CalibrationResult(replace(found, cpu_seconds=spent, warnings=session.warnings + found.warnings), session)
 
 

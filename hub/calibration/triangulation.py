@@ -21,24 +21,13 @@ from hub.calibration.result import trajectory_tables
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import Refused
-from protocols.geometry.pose import Pose
+from protocols.geometry.pose import OUR_CONVENTION, POSE_CONVENTIONS
 from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration, TrajectoryTable
 from protocols.session.observations import Observations
 from protocols.session.rig import METRES_PER_UNIT, Rig
 
 _SOUND_M_S = 340.0  # at 1000 times its size, what walks, drives or flies is beyond it
-_CAMERA_AXES_UP = np.diag([1.0, -1.0, -1.0])
-_CONVENTIONS: dict[str, Callable[[Pose], Pose]] = {
-    "translation is the camera's place in the world": lambda pose: Pose(pose.rotation, pose.translation),
-    "rotation and translation are world from camera": lambda pose: Pose(pose.rotation.T, pose.translation),
-    "rotation is world from camera": lambda pose: Pose(pose.rotation.T, -pose.rotation @ pose.translation),
-    "cameras look along -z, with y up": lambda pose: Pose(_CAMERA_AXES_UP @ pose.rotation, pose.position),
-    "rotation and translation are world from camera, and cameras look along -z, with y up": lambda pose: Pose(
-        _CAMERA_AXES_UP @ pose.rotation.T, pose.translation
-    ),
-}
-"""What other tools write where ``rotation`` and ``translation`` are expected, and the pose that is meant."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,17 +57,8 @@ def triangulate(
     try:
         return _triangulate(rig, known, observations, report)
     except Refused as refusal:
-        for convention, pose_of in _CONVENTIONS.items():
-            others = {name: replace(camera, pose=pose_of(camera.pose)) for name, camera in known.items()}
-            with suppress(Refused):
-                fitting = _triangulate(rig, others, observations, report).sigma_px
-                if 2 * len(fitting) <= len(known):  # two may fit by chance
-                    continue
-                refusal.reason = (
-                    f"the rows fit {len(fitting)} cameras if in the calibration {convention}; give rotation and "
-                    "translation camera from world, as OpenCV and aniposelib have them"
-                )
-                break
+        meant = meant_convention(known, lambda others: len(_triangulate(rig, others, observations, report).sigma_px))
+        refusal.reason = meant or refusal.reason
         raise
 
 
@@ -115,7 +95,7 @@ def _triangulate(
     if not any(len(table.time) for table in tables):
         raise Refused("no label is seen by two cameras within 0.2 s of each other", unused)
     sigmas = _sigmas(reconstruction)
-    warnings = [*prepared.warnings, *_unlikely_speed(rig, tables)]
+    warnings = [*prepared.warnings, *unlikely_speed(rig.metadata.get("scale", "metric"), rig.units, tables)]
     for name, (sigma, calibrated_rms) in larger_residuals(reconstruction, known).items():
         warnings.append(f"{name}: residuals of {sigma:.1f} px, {calibrated_rms:.1f} px when it was calibrated")
     triangulated = {table.label for table in tables if len(table.time)}
@@ -128,15 +108,31 @@ def _triangulate(
     )
 
 
-def _unlikely_speed(rig: Rig, tables: tuple[TrajectoryTable, ...]) -> tuple[str, ...]:
-    """A warning where what is triangulated moves faster than sound by the calibration's units."""
-    if rig.metadata.get("scale", "metric") != "metric":
+def meant_convention(
+    known: Mapping[str, CameraCalibration], fitting: Callable[[dict[str, CameraCalibration]], int]
+) -> str:
+    """The convention of poses in which a calibration fits the rows that contradict it, as a reason; empty: in none.
+
+    fitting: the number of cameras that fit with the given ones; it may raise Refused.
+    """
+    for convention, pose_of in POSE_CONVENTIONS.items():
+        others = {name: replace(camera, pose=pose_of(camera.pose)) for name, camera in known.items()}
+        with suppress(Refused):
+            count = fitting(others)
+            if 2 * count > len(known):  # two may fit by chance
+                return f"the rows fit {count} cameras if in the calibration {convention}; {OUR_CONVENTION}"
+    return ""
+
+
+def unlikely_speed(scale: str, units: str, tables: tuple[TrajectoryTable, ...]) -> tuple[str, ...]:
+    """A warning where what moves is faster than sound by a given calibration's scale and units."""
+    if scale != "metric":
         return ()
     speeds = [np.linalg.norm(np.diff(one.position, axis=0), axis=1) / np.diff(one.time) for one in tables]
-    typical = METRES_PER_UNIT[rig.units] * float(np.median(np.concatenate([np.zeros(1), *speeds])))
+    typical = METRES_PER_UNIT[units] * float(np.median(np.concatenate([np.zeros(1), *speeds])))
     if typical < _SOUND_M_S:
         return ()
-    return (f"it moves at {typical:.3g} m/s as a rule: the calibration's positions seem not to be in {rig.units}",)
+    return (f"it moves at {typical:.3g} m/s as a rule: the calibration's positions seem not to be in {units}",)
 
 
 def _reconstruct(prepared: PreparedSession, known: Mapping[str, CameraCalibration], names: list[str]) -> Reconstruction:

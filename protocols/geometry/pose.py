@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,20 @@ class Pose:
     def world_from_camera(self, points: Floats) -> Floats:
         """Points (n, 3) in camera axes, in the world (n, 3)."""
         return np.asarray(points @ self.rotation + self.position)
+
+
+_CAMERA_AXES_UP = np.diag([1.0, -1.0, -1.0])
+POSE_CONVENTIONS: dict[str, Callable[[Pose], Pose]] = {
+    "translation is the camera's place in the world": lambda pose: Pose(pose.rotation, pose.translation),
+    "rotation and translation are world from camera": lambda pose: Pose(pose.rotation.T, pose.translation),
+    "rotation is world from camera": lambda pose: Pose(pose.rotation.T, -pose.rotation @ pose.translation),
+    "cameras look along -z, with y up": lambda pose: Pose(_CAMERA_AXES_UP @ pose.rotation, pose.position),
+    "rotation and translation are world from camera, and cameras look along -z, with y up": lambda pose: Pose(
+        _CAMERA_AXES_UP @ pose.rotation.T, pose.translation
+    ),
+}
+"""What other tools write where ``rotation`` and ``translation`` are expected, and the pose that is meant."""
+OUR_CONVENTION = "give rotation and translation camera from world, as OpenCV and aniposelib have them"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

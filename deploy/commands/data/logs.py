@@ -168,6 +168,7 @@ def replay(
         else:
             from deploy.logs.replay_hub import replay_through_hub
 
+            _check_people(log, calibration)
             count = replay_through_hub(log, out, calibration=calibration)
         return answer({"written": count}, [f"{count} messages written to {out}"], json)
     if compare is not None:
@@ -188,6 +189,14 @@ def replay(
     except BusStopped:
         count = 0
     return answer({"published": count}, [f"{count} messages published"], json)
+
+
+def _check_people(log: Path, calibration: Path | None) -> None:
+    """Print what is wrong with a calibration for the people in a log. Raises InputError."""
+    from deploy.offline.follow.source import check_log
+
+    for warning in check_log(log, calibration) if calibration is not None else ():
+        print(f"syncline: {log}: {warning}", file=sys.stderr)
 
 
 def _warn_of_damage(log: Path) -> None:

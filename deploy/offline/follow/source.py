@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.offline.follow.calibration import GivenCalibration
+from deploy.offline.follow.calibration import GivenCalibration, read_given_calibration
 from deploy.offline.follow.objects import (
     BOXES_FILE,
     Kind,
@@ -153,6 +153,14 @@ def _read_log(file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
         if len(count) > 1
     )
     return [message for message in messages if message.boot_id == boots[message.camera]], damage + restarts
+
+
+def check_log(file: Path, calibration: Path) -> tuple[str, ...]:
+    """Warnings about the people in a log as `follow` gives them. Raises InputError where they contradict the units,
+    pictures, poses or vertical of a calibration.toml."""
+    known = read_given_calibration(calibration)
+    found, _ = followed_detections(_without_clock_steps(_read_log(file)[0])[0], "person", known.sizes)
+    return check_units(found, known, "person", file) if any(message.detections for message in found) else ()
 
 
 def _without_clock_steps(messages: list[pb.Observation]) -> tuple[list[pb.Observation], tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Whether detections and a calibration are in the same pixels and the stated units: people are about 1.7 m tall."""
+"""Whether detections and a calibration are in the same pixels, units and axes: people are upright, about 1.7 m tall."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.target_models import PERSON
 from protocols.core.errors import InputError
 from protocols.core.files import read_text
+from protocols.geometry.pose import OUR_CONVENTION, POSE_CONVENTIONS
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration
@@ -38,6 +39,7 @@ _SAME_TIME_NS = 250_000_000  # a camera at 2 Hz has a frame as near as this to e
 _MIN_SHARE, _CLEARLY = 0.2, 4.0
 """Least share of people whom two cameras see at one place, and how many times the share in the stated units it must be.
 In the crowd of seven cameras the share is 0.42 in metres, and at most 0.11, by chance, in any other of these units."""
+_UPRIGHT = 0.7  # cosine of 45°: nobody upright leans as much
 _MIN_LOOKED_AT, _MIN_MET = 30, 0.1
 """People at places where another camera looks, and the share that it sees there, below which a warning is given: 0.42
 in that crowd and 0.78 in a simulated room, at most 0.06 with the pixels of pictures that were squeezed into squares."""
@@ -46,11 +48,14 @@ in that crowd and 0.78 in a simulated room, at most 0.06 with the pixels of pict
 @dataclass(frozen=True, slots=True)
 class _Mistake:
     """Detections and calibration as they may be wrong by factors: lengths of the calibration, pixels of the detections,
-    and the part of a body that they show, from head (0) to foot (1)."""
+    and the part of a body that they show, from head (0) to foot (1); with ``up``, of another vertical, and with poses
+    in another of `POSE_CONVENTIONS`."""
 
     lengths: float = 1.0
     pixels: float = 1.0
     body: tuple[float, float] = (0.0, 1.0)
+    up: bool = False
+    poses: str = ""
 
 
 _MISTAKES = (
@@ -58,17 +63,20 @@ _MISTAKES = (
     *(_Mistake(lengths=factor) for factor in _LENGTHS),
     *(_Mistake(pixels=factor) for factor in _PIXELS),
     *(_Mistake(body=half) for half in _HALVES),
+    _Mistake(up=True),
+    *(_Mistake(up=True, poses=convention) for convention in POSE_CONVENTIONS),  # `up` may be of one camera's axes
 )
 
 
 def check_units(
     messages: Sequence[pb.Observation], known: GivenCalibration, kind: str, session: Path
 ) -> tuple[str, ...]:
-    """Refuse detections and a calibration in which people meet only in other units, pixels, or with longer bodies.
+    """Refuse detections and a calibration in which people meet only in other units, pixels, axes, or as longer bodies.
 
-    Units: 10, 100 or 1000 times the stated, feet, inches. Every camera alone gives a person's place in multiples of the
-    person's height. In the right units and pixels the places that several cameras give coincide. Returns a warning
-    where they hardly do in any. Raises InputError. For an arbitrary scale nothing is checked.
+    Units: 10, 100 or 1000 times the stated, feet, inches. Axes: another vertical, or another convention of the poses.
+    Every camera alone gives a person's place in multiples of the person's height. In the right units, pixels and axes
+    the places that several cameras give coincide. Returns a warning where they hardly do in any. Raises InputError. For
+    an arbitrary scale nothing is checked.
     """
     if kind != "person" or known.calibration.scale != "metric":
         return ()
@@ -77,23 +85,38 @@ def check_units(
     if not people:
         return ()
     bodies = [_bodies(people, known, wrong) for wrong in _MISTAKES]
+    count = sum(len(rows) for rows in people.values())
     shares = [
-        float(_met(one, wrong.lengths * height).sum()) / max(len(one.time), 1)
-        for one, wrong in zip(bodies, _MISTAKES, strict=True)
+        float(_met(one, wrong.lengths * height).sum()) / count for one, wrong in zip(bodies, _MISTAKES, strict=True)
     ]
-    best = int(np.argmax(shares))
-    if shares[best] < max(_MIN_SHARE, _CLEARLY * shares[0]):
+    best, vertical = int(np.argmax(shares)), _MISTAKES.index(_Mistake(up=True))
+    # Along a vertical far off, bodies are near 0 and many meet by chance.
+    if bodies[0].up @ bodies[vertical].up < _UPRIGHT and shares[vertical] > max(_MIN_SHARE, shares[0]):
+        best = vertical
+    elif shares[best] < max(_MIN_SHARE, _CLEARLY * shares[0]):
         return _nowhere(bodies[0], [known.calibration.cameras[name] for name in people], height)
-    raise _refusal(_MISTAKES[best], known, session)
+    raise _refusal(_MISTAKES[best], bodies[best].up, known, session)
 
 
-def _refusal(wrong: _Mistake, known: GivenCalibration, session: Path) -> InputError:
+def _refusal(wrong: _Mistake, up: Floats, known: GivenCalibration, session: Path) -> InputError:
+    if wrong.poses:
+        return InputError(
+            f"people meet at one place if in the calibration {wrong.poses}", file=known.file, remedy=OUR_CONVENTION
+        )
+    if wrong.up:
+        direction = ", ".join(f"{value + 0.0:.2f}" for value in np.round(up, 2))
+        return InputError(
+            f"`up` is not the vertical of these people, who stand along [{direction}] in the world",
+            file=known.file,
+            line=_line_of(known, r"\s*up\s*=", r"\s*\[metadata\]"),
+            remedy="correct up in [metadata], or leave it out",
+        )
     if wrong.lengths != 1.0:
         return InputError(
             f"the cameras' positions are {_times(wrong.lengths)} for people of {PERSON.size_m:g} m: they are not in "
             f"{known.calibration.units}",
             file=known.file,
-            line=_line_of_units(known),
+            line=_line_of(known, r"\s*units\s*=", r"\s*\[metadata\]", r"\s*translation\s*="),
             remedy="correct units in [metadata], or the translations, or up",
         )
     if wrong.pixels != 1.0:
@@ -111,12 +134,13 @@ def _times(factor: float) -> str:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Bodies:
     """n people, each seen by one camera. time: (n,) [ns]. owner: (n,) index of the camera. centre: (n, 3) of
-    that camera. foot: (n, 3) from there to the foot, in people's heights."""
+    that camera. foot: (n, 3) from there to the foot, in people's heights. up: (3,), along which they are upright."""
 
     time: Floats
     owner: Ints
     centre: Floats
     foot: Floats
+    up: Floats
 
 
 def _people(messages: Sequence[pb.Observation], known: GivenCalibration) -> dict[str, Floats]:
@@ -144,21 +168,22 @@ def _bodies(people: Mapping[str, Floats], known: GivenCalibration, wrong: _Mista
     rays: list[tuple[Floats | Ints, ...]] = []
     for name, rows in people.items():
         camera = known.calibration.cameras[name]
+        pose = POSE_CONVENTIONS[wrong.poses](camera.pose) if wrong.poses else camera.pose
         top, bottom = wrong.body
         whole = (rows[:, 3:] - rows[:, 1:3]) / (bottom - top)
         pixels = np.vstack([rows[:, 1:3] - top * whole, rows[:, 3:] + (1.0 - bottom) * whole]) / wrong.pixels
-        ends = np.hstack([camera.intrinsics.unproject(pixels), np.ones((len(pixels), 1))]) @ camera.pose.rotation
-        owner, centre = np.full(len(rows), len(rays)), np.tile(camera.pose.position, (len(rows), 1))
+        ends = np.hstack([camera.intrinsics.unproject(pixels), np.ones((len(pixels), 1))]) @ pose.rotation
+        owner, centre = np.full(len(rows), len(rays)), np.tile(pose.position, (len(rows), 1))
         rays.append((owner, centre, rows[:, 0], *np.split(ends, 2)))
     owner, centre, time, head, foot = (np.concatenate(part) for part in zip(*rays, strict=True))
-    up = known.up
+    up = None if wrong.up else known.up
     if up is None:
         normal = np.nan_to_num(np.cross(head, foot))
         up = np.linalg.eigh(normal.T @ normal)[1][:, 0]
         up = up * np.sign(np.nan_to_num(head - foot).sum(axis=0) @ up)
     distance = _distance_per_height(head, foot, up)
     good = np.isfinite(distance) & (distance > 0.0)
-    return _Bodies(time[good], owner[good], centre[good], (distance[:, None] * foot)[good])
+    return _Bodies(time[good], owner[good], centre[good], (distance[:, None] * foot)[good], up)
 
 
 def _met(bodies: _Bodies, height: float) -> Bools:
@@ -201,7 +226,6 @@ def _distance_per_height(head: Floats, foot: Floats, up: Floats) -> Floats:
         return np.asarray(-(across * wanted).sum(axis=1) / (across**2).sum(axis=1))
 
 
-def _line_of_units(known: GivenCalibration) -> int:
+def _line_of(known: GivenCalibration, *patterns: str) -> int:
     lines = read_text(known.file).splitlines()
-    patterns = (r"\s*units\s*=", r"\s*\[metadata\]", r"\s*translation\s*=")
     return next((n for p in patterns for n, line in enumerate(lines, 1) if re.match(p, line)), 1)

@@ -239,8 +239,12 @@ def fit_state(
     mean = prior.copy()
     start_ns = detections[0].reference_ns
     for step in range(_GAUSS_NEWTON_STEPS + 1):
-        hessian = np.diag(information)
-        gradient = information * (prior - mean)
+        # Heights of adults, with the tails that children need: one of 0.9 m is 9 stds away.
+        tall = information[LOG_SIZE] * (mean[LOG_SIZE] - prior[LOG_SIZE]) ** 2
+        held = information.copy()
+        held[LOG_SIZE] /= student_t_inflation(tall)
+        hessian = np.diag(held)
+        gradient = held * (prior - mean)
         misfits, counts = [], []
         for detection in detections:
             elapsed = (detection.reference_ns - start_ns) / NANOSECONDS
@@ -265,7 +269,7 @@ def fit_state(
             counts.append(max(count, 1))
         if step < _GAUSS_NEWTON_STEPS:
             mean = mean + np.linalg.solve(hessian, gradient)
-    chi2 = sum(misfits) + float((information * (mean - prior) ** 2)[VELOCITY.start :].sum())
+    chi2 = sum(misfits) + float((information * (mean - prior) ** 2)[VELOCITY].sum() + student_t_cost(tall))
     worst = int(np.argmax(np.array(misfits) / np.array(counts)))
     covariance = np.linalg.inv(hessian)
     return mean, 0.5 * (covariance + covariance.T), chi2, max(sum(counts) - 3, 1), worst

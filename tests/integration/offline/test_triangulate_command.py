@@ -174,6 +174,8 @@ def test_millimetres_where_metres_are_stated_are_warned_of(session: Path, tmp_pa
         known, out = str(tmp_path / "known.toml"), tmp_path / "track.csv"
         assert run(["triangulate", str(session), "--calibration", known, "--out", str(out)]) == 0
         assert ("positions seem not to be in m" in capsys.readouterr().out) == (factor > 1.0)
+        assert run(["calibrate", str(session), "--from-known", known, "--out", str(tmp_path / "out")]) == 0
+        assert ("positions seem not to be in m" in capsys.readouterr().out) == (factor > 1.0)
 
 
 @pytest.mark.parametrize(
@@ -211,3 +213,5 @@ def test_another_convention_of_poses_is_named(
     assert run(["triangulate", str(session), "--calibration", known, "--out", str(out)]) == 3
     assert f"if in the calibration {report};" in capsys.readouterr().err
     assert not out.exists()
+    assert run(["calibrate", str(session), "--from-known", known, "--out", str(tmp_path / "out")]) == 3
+    assert f"if in the calibration {report};" in capsys.readouterr().err

@@ -3,20 +3,39 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
 
 from deploy.offline.follow.calibration import read_given_calibration
 from deploy.offline.follow.objects import followed_detections, object_messages, read_objects
 from deploy.offline.follow.source import FollowInput, read_follow_input
 from protocols.core.errors import InputError, Refused
-from tests.support.crowds import NAMES, SIZE, boxes_csv, ends, write_calibration
+from protocols.geometry.pose import POSE_CONVENTIONS, Pose
+from tests.support.crowds import NAMES, SIZE, boxes_csv, ends, poses, write_calibration
+from tests.support.rigs import looking_at
 
 SIZES = dict.fromkeys(NAMES, SIZE)
+_UP = np.diag([1.0, -1.0, -1.0])
+_WRITTEN: dict[str, Callable[[Pose], Pose]] = dict(
+    zip(
+        POSE_CONVENTIONS,
+        [
+            lambda meant: Pose(meant.rotation, -meant.rotation.T @ meant.position),
+            lambda meant: Pose(meant.rotation.T, -meant.rotation @ meant.position),
+            lambda meant: Pose(meant.rotation.T, -meant.rotation @ meant.translation),
+            lambda meant: Pose(_UP @ meant.rotation, meant.position),
+            lambda meant: Pose((_UP @ meant.rotation).T, -_UP @ meant.rotation @ meant.position),
+        ],
+        strict=True,
+    )
+)
+"""What stands in a file that is written in each convention, as the pose that is read from it."""
 BOXES = "camera,frame,time,x,y,width,height\n"
 
 
@@ -195,6 +214,36 @@ def test_a_calibration_in_other_units_is_refused(scale: float, tmp_path: Path) -
     ) as caught:
         read_follow_input(tmp_path, known, "person", tmp_path)
     assert f"{max(scale, 1.0 / scale):.4g} times too {'large' if scale > 1.0 else 'small'}" in str(caught.value)
+
+
+@pytest.mark.parametrize("convention", POSE_CONVENTIONS)
+@pytest.mark.parametrize("up", ["given", "left out", "left"])
+def test_another_convention_of_poses_is_named(convention: str, up: str, tmp_path: Path) -> None:
+    """They were followed as a few tracks of nobody, or refused as other units, clocks or cameras."""
+    (tmp_path / "boxes.csv").write_text(boxes_csv(3.0), encoding="utf-8")
+    tables = tomllib.loads(write_calibration(tmp_path / "calibration.toml").read_text(encoding="utf-8"))
+    turn = looking_at(np.zeros(3), np.array([3.0, 4.0, 1.0])).rotation  # else two of the conventions are one
+    tables["metadata"]["up"] = turn.T[:, 2].tolist() if up == "given" else up
+    if up == "left out":
+        del tables["metadata"]["up"]
+    for name in NAMES:
+        meant = Pose(poses()[name].rotation @ turn, turn.T @ poses()[name].position)
+        written = _WRITTEN[convention](meant)
+        tables[name] |= {"rotation": written.rodrigues.tolist(), "translation": written.translation.tolist()}
+    (tmp_path / "calibration.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+    known = read_given_calibration(tmp_path / "calibration.toml")
+    with pytest.raises(InputError, match=rf"people meet at one place if in the calibration {convention};"):
+        read_follow_input(tmp_path, known, "person", tmp_path)
+
+
+@pytest.mark.parametrize("up", [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+def test_another_vertical_is_named(up: list[float], tmp_path: Path) -> None:
+    (tmp_path / "boxes.csv").write_text(boxes_csv(3.0), encoding="utf-8")
+    known = replace(read_given_calibration(write_calibration(tmp_path / "calibration.toml")), up=np.array(up))
+    with pytest.raises(
+        InputError, match=r"toml:5: `up` is not the vertical .* who stand along \[.*, 1\.00\] in the wor"
+    ):
+        read_follow_input(tmp_path, known, "person", tmp_path)
 
 
 def test_nobody_is_a_refusal(tmp_path: Path) -> None:

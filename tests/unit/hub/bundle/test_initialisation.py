@@ -91,6 +91,8 @@ def test_a_path_of_few_frames_a_knot_has_denser_knots(fps: float, share: float) 
     cameras = [CameraInput(name, lens, {"joint": track}) for name in "abcd"]
     assert knot_spacing(cameras, "joint") == share * track.basis.spacing
     assert knot_spacing(cameras[:2], "joint") == track.basis.spacing  # two have too few rows for so many knots
+    body = [replace(camera, tracks=dict.fromkeys(["joint", *"0123456"], track)) for camera in cameras]
+    assert knot_spacing(body, "joint") == 0.5 * track.basis.spacing  # what the path does not follow, all joints do
 
 
 def test_while_a_large_network_grows_only_new_cameras_are_adjusted() -> None:
