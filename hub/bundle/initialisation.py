@@ -306,7 +306,7 @@ def _subsampled(problem: Problem, state: AdjustmentState) -> Problem:
     return replace(problem, rows=tuple(out))
 
 
-def knot_spacing(cameras: list[CameraInput], label: str) -> float:
+def knot_spacing(cameras: list[CameraInput], label: str, large: bool = False) -> float:
     """Knot spacing [s] of a label's trajectory: the finest by the tracks' cross-validation, or half of it.
 
     Of few frames a knot in each track these, not the motion, limit what it follows; the path has other cameras' too.
@@ -319,8 +319,9 @@ def knot_spacing(cameras: list[CameraInput], label: str) -> float:
     rates = [1.0 / float(np.median(np.diff(track.time))) for track in tracks]
     spacing = min(track.basis.spacing for track in tracks)
     most = max(track.basis.spacing * rate for track, rate in zip(tracks, rates, strict=True))
-    few = most < _FEW_FRAMES_PER_KNOT or sum(map(_tracks_at_once, seeing)) > _MANY_TRACKS
-    if few and 0.5 * spacing * sum(rates) > _MANY_ROWS:
+    # A large network's clocks are no more exact with them, and take a tenth more of CPU.
+    many = not large and sum(map(_tracks_at_once, seeing)) > _MANY_TRACKS
+    if (most < _FEW_FRAMES_PER_KNOT or many) and 0.5 * spacing * sum(rates) > _MANY_ROWS:
         spacing *= 0.5
     return float(np.clip(spacing, _MIN_KNOT_SPACING, _MAX_KNOT_SPACING))
 
@@ -351,7 +352,7 @@ def triangulate_label(
         return None
     # Rows of a single camera far from two-camera stretches are not covered: they do not constrain the adjustment.
     begins, ends = split_at_gaps(time[good], _MAX_GAP)
-    spacing = knot_spacing([cameras[name] for name in names], label)
+    spacing = knot_spacing([cameras[name] for name in names], label, len(cameras) > LARGE_NETWORK)
     basis = SplineBasis.covering(begins - 0.5 * spacing, ends + 0.5 * spacing, spacing)
     time, points = time[good], points[good]
     weight, rows = np.ones(len(time)), basis.weights(time)
