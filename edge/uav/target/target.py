@@ -160,7 +160,7 @@ class Target:
         """Adapt the appearance slightly to a certain, complete detection."""
         patch = self.patch(image, best.ground, 1.6)
         if patch is not None:
-            self.appearance.learn(patch, best.ground, _LEARNING_RATE)
+            self.appearance.learn(patch, best.ground, _LEARNING_RATE, self.aligned)
         self.appearance.calibrate(best.colour, best.shape, 0.05)
 
     def change_frame(self, position: Floats, jacobian: Floats) -> None:
@@ -188,7 +188,7 @@ class Target:
             return
         if rate >= 1.0:
             self.appearance.reset()
-        self.appearance.learn(patch, self.position, rate)
+        self.appearance.learn(patch, self.position, rate, self.aligned)
         self.local_gain.set_reference(self.appearance.log_brightness(patch, self.position))
         candidates = self.appearance.candidates(patch, min_score=-1.0)
         near = [c for c in candidates if np.linalg.norm(c.ground - self.position) < 0.3 * self.length]
