@@ -367,7 +367,7 @@ def _separating_channel(cells: Image, target: Floats, background: Floats) -> Sin
     colours = cells.reshape(-1, 3) - background.ravel() @ cells.reshape(-1, 3)
     moments = [(colours * weights.reshape(-1, 1)).T @ colours for weights in (target, background)]
     whitened = np.linalg.inv(np.linalg.cholesky(moments[1] + np.eye(3)))  # one grey level: below is noise
-    values, vectors = np.linalg.eigh(whitened @ moments[0] @ whitened.T)
+    _, vectors = np.linalg.eigh(whitened @ moments[0] @ whitened.T)
     by_brightness = _BRIGHTNESS @ moments[0] @ _BRIGHTNESS / (_BRIGHTNESS @ (moments[1] + np.eye(3)) @ _BRIGHTNESS)
     if by_brightness >= _MIN_BRIGHTNESS_CONTRAST:
         return None
