@@ -218,6 +218,7 @@ class GroundTracker:
             target.length,
             reacquiring,
             lambda found: target.aligned and target.appearance.shape_matches(found),
+            target.crab_angle,
         )
         if measurement.likelihood is not None:
             self._particles = particles.reweighted(measurement.likelihood)
@@ -260,7 +261,9 @@ class GroundTracker:
         centre = weights @ positions
         distance = np.hypot(*(positions - centre).T)
         reach = quantile(distance, 0.97) if wide else 1.5 * self._target.length
-        angle = pf.circular_mean(self._particles.heading[members], weights) if self._target.aligned else None
+        angle = None
+        if self._target.aligned:
+            angle = pf.circular_mean(self._particles.heading[members], weights) + self._target.crab_angle
         if wide:
             self._target.update_resolution(centre)
             if angle is not None:
@@ -274,10 +277,10 @@ class GroundTracker:
         angles = []
         if near is not None and near.age > 1:
             course = near.course()
-            angles = [near.angle] if course is None else [near.angle, course]
+            angles = [near.angle] if course is None else [near.angle, course + self._target.crab_angle]
         nearby = np.flatnonzero(np.square(self._particles.position - first.ground).sum(axis=1) < self._target.length**2)
         if len(nearby):
-            angles.append(float(self._particles.heading[self._rng.choice(nearby)]))
+            angles.append(float(self._particles.heading[self._rng.choice(nearby)]) + self._target.crab_angle)
         step = _ROTATION_STEPS[self._frame // _ROTATED_CANDIDATES % len(_ROTATION_STEPS)]
         angles += [first.angle + step, first.angle - step]
         trial_angles = [angle for angle in angles if np.cos(angle - first.angle) < _SAME_ANGLE_COSINE][:_MAX_ROTATIONS]
@@ -358,7 +361,7 @@ class GroundTracker:
                 self._particles, best.ground, target.position_std(best.visible_share), self._rng
             )
             if target.aligned and target.appearance.shape_matches(best):
-                heading = best.angle + self._rng.normal(0.0, _HEADING_STD, len(self._particles))
+                heading = best.angle - target.crab_angle + self._rng.normal(0.0, _HEADING_STD, len(self._particles))
                 self._particles = replace(self._particles, heading=heading)
         if reacquiring:
             self._history.restart(*self._particles.mean_velocity())
@@ -397,6 +400,8 @@ class GroundTracker:
             sure, complete = measurement.posterior > 0.9, best.visible_share > 0.98
             if sure and complete:
                 target.update_typical_score(best.score)
+                if not reacquiring and best.angle != target.angle:
+                    target.update_crab_angle(best, self._heading)
             if sure and not measurement.ambiguous:
                 target.update_local_gain(image, best)
                 if self._frame % 4 == 0 and complete and best.score > 0.75:

@@ -26,6 +26,8 @@ _MAX_TARGET_CELLS = 30.0  # the target's length in patch cells
 _MIN_TARGET_CELLS = 12.0  # the same, at least: cells of 0.4 m still tell a car's windows from its roof
 _MAX_PATCH_CELLS = 200  # per side
 _MIN_SHAPE_RATIO = 0.75  # to the typical shape response: the same car under other illumination
+_BRIGHTNESS = np.array([0.114, 0.587, 0.299])  # of blue, green and red, as in OpenCV's grey
+_MIN_BRIGHTNESS_CONTRAST = 1.0  # squared, in variances of the background: below, it is as bright as the ground
 _MIN_VISIBLE_SHARE = 0.3  # of the footprint inside the image
 
 
@@ -150,6 +152,7 @@ class AppearanceModel:
         self._log_ratio_table: Singles = np.zeros(_BINS**3, np.float32)
         self._template: Singles | None = None
         self._first_template: Singles | None = None
+        self._channel: Singles | None = None  # weights (1, 3) of blue, green and red; None: brightness
         self.colour_scale = 1.0
         self._shape_scale = 0.9
 
@@ -208,8 +211,11 @@ class AppearanceModel:
             if old is not None and old.shape[::-1] != size:
                 setattr(self, name, cv2.resize(old, size, interpolation=cv2.INTER_AREA))
 
-    def learn(self, patch: GroundPatch, centre: Floats, rate: float) -> None:
-        """Update from the target at ``centre`` (2,) ground in a patch. rate: 1 = replace the model."""
+    def learn(self, patch: GroundPatch, centre: Floats, rate: float, moving: bool = False) -> None:
+        """Update from the target at ``centre`` (2,) ground in a patch.
+
+        rate: 1 = replace the model. moving: whether the target's motion is known, which tells it from the ground.
+        """
         nx, ny = self._target_mask.shape[1] // 2, self._target_mask.shape[0] // 2
         at = patch.to_cells(centre[None])[0]
         template_size = (2 * nx + 1, 2 * ny + 1)
@@ -241,7 +247,13 @@ class AppearanceModel:
         floor = 2e-5
         ratio = np.log((target_histogram + floor) / (self._background_histogram + floor))
         self._log_ratio_table = np.clip(ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO).astype(np.float32)
-        grey = cv2.cvtColor(cells, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        if rate >= 1.0 or self._template is None:
+            self._channel = _separating_channel(patch.cells, weights[0] / totals[0], weights[1] / totals[1])
+        grey = self._grey(np.asarray(cells, np.uint8))
+        if not moving:
+            # What lies around stays behind on the ground, and would hold the template there; its mean level is enough.
+            level = np.float32((grey * self._ring_mask).sum() / self._ring_mask.sum())
+            grey = level + self._target_mask * (grey - level)
         if self._template is None or self._first_template is None:
             self._template = self._first_template = grey
         else:
@@ -317,12 +329,18 @@ class AppearanceModel:
                 break
         return found
 
+    def _grey(self, cells: Image) -> Singles:
+        """The one channel (h, w) of the shape."""
+        if self._channel is None:
+            return np.asarray(cv2.cvtColor(cells, cv2.COLOR_BGR2GRAY), np.float32)
+        return np.asarray(cv2.transform(cells.astype(np.float32), self._channel), np.float32)
+
     def _shape_response(self, patch: GroundPatch, border: tuple[int, int, int, int]) -> Singles:
         """Normalised cross-correlation with the template, maximum over the first and the adapted one."""
         best = np.zeros(patch.valid.shape, np.float32)
         if self._template is None or self._first_template is None:
             return best
-        grey = np.asarray(cv2.cvtColor(patch.cells, cv2.COLOR_BGR2GRAY), np.float32)
+        grey = self._grey(patch.cells)
         if patch.complete:
             grey = np.asarray(cv2.copyMakeBorder(grey, *border, cv2.BORDER_REPLICATE), np.float32)
         else:
@@ -337,6 +355,24 @@ class AppearanceModel:
                 found = _masked_correlation(grey, valid, sums, template)
             best = np.maximum(best, found) if number else found
         return np.where(np.isfinite(best), best, np.float32(0.0))
+
+
+def _separating_channel(cells: Image, target: Floats, background: Floats) -> Singles | None:
+    """Weights (1, 3) of the colours in which a target stands out, where it does not by brightness, else None.
+
+    Its mean squared difference from the background's mean, in variances of the background, is the greatest: what is
+    inside of a target, such as a car's windows, counts as its outline does. target, background: weights (h, w), sum 1,
+    of the cells (h, w, 3).
+    """
+    colours = cells.reshape(-1, 3) - background.ravel() @ cells.reshape(-1, 3)
+    moments = [(colours * weights.reshape(-1, 1)).T @ colours for weights in (target, background)]
+    whitened = np.linalg.inv(np.linalg.cholesky(moments[1] + np.eye(3)))  # one grey level: below is noise
+    _, vectors = np.linalg.eigh(whitened @ moments[0] @ whitened.T)
+    by_brightness = _BRIGHTNESS @ moments[0] @ _BRIGHTNESS / (_BRIGHTNESS @ (moments[1] + np.eye(3)) @ _BRIGHTNESS)
+    if by_brightness >= _MIN_BRIGHTNESS_CONTRAST:
+        return None
+    best = vectors[:, -1] @ whitened
+    return np.asarray(best / np.abs(best).sum(), np.float32)[None]
 
 
 def _correlate(field: Singles, kernel: Singles, method: int = cv2.TM_CCORR) -> Singles:

@@ -65,6 +65,7 @@ def evaluate_candidates(
     length: float,
     reacquiring: bool,
     shape_matches: Callable[[Candidate], bool],
+    crab_angle: float = 0.0,
 ) -> MeasurementLikelihood:
     """Likelihood of the particles: p = 1 - c + c sum_j r_j N(z_j; x, R) / clutter.
 
@@ -72,7 +73,7 @@ def evaluate_candidates(
     candidate's position, one coordinate [ground units], unoccluded, and if its missing score is due to occlusion.
     length: the target's. reacquiring: the target has been out of view for a while: the likelihood of one frame is then
     limited, the shape must match too, and the tracklet's velocity must match the particles'. shape_matches: whether a
-    candidate's shape matches so well that its angle is the target's heading.
+    candidate's shape matches so well that its angle, less the ``crab_angle``, is the target's heading.
     """
     gain = np.zeros((len(candidates), len(particles)))
     in_gate = np.zeros((len(candidates), len(particles)), np.bool_)
@@ -101,7 +102,7 @@ def evaluate_candidates(
                 in_gate[j] &= velocity_distance < _GATE**2
                 squared = squared + velocity_distance
                 if shape_matches(candidate):
-                    heading_error = (particles.heading - candidate.angle + np.pi) % (2 * np.pi) - np.pi
+                    heading_error = (particles.heading + crab_angle - candidate.angle + np.pi) % (2 * np.pi) - np.pi
                     squared = squared + np.square(heading_error / _HEADING_STD)
         gain[j] = peak * np.exp(-0.5 * np.minimum(squared, 50.0))
     miss_likelihood = 1.0 - detection_probability

@@ -48,7 +48,7 @@ class Redetector:
             plausibility = path_plausibility(blob, fit, target.length, time)
             if plausibility <= 0.0:
                 continue
-            found = target.search(image, blob.positions[-1], 1.1, course)
+            found = target.search(image, blob.positions[-1], 1.1, course + target.crab_angle)
             if found:
                 out.append((blob, found[0], plausibility))
         return out

@@ -23,6 +23,7 @@ _FULL_SHARE = 0.97  # visible share that counts as complete
 _MAX_HALF_CELLS = 100  # half size of a patch
 _OCCLUSION_MARGIN = 0.1  # decrease of the score below its typical value without occlusion
 _OCCLUSION_STD = 0.6  # std of the position in target lengths, per unit of score beyond that margin
+_MAX_BODY_ERROR = 0.35  # of an axis found by colour: the course, where it is nearer, is exacter [rad]
 _TYPICAL_RATE_UP, _TYPICAL_RATE_DOWN = 0.1, 0.02  # of the typical score, per frame
 
 
@@ -45,8 +46,12 @@ class Target:
         self._box = (box.width * float(np.hypot(*right)), box.height * float(np.hypot(*down)))
         self.angle = float(np.arctan2(right[1], right[0]))
         """Direction of the patch's x axis on the ground [rad]."""
+        self._box_angle = self.angle  # of the box as drawn
         self.aligned = False
         """Whether the patch is aligned with the heading, which is estimated once the car has moved."""
+        self.crab_angle = 0.0
+        """Angle of the body from the course [rad]: not all that moves moves along its axis."""
+        self._oriented = False  # whether the patch is aligned with the body's axis before the heading is known
         self.scale = float(np.sqrt(abs(np.linalg.det(axes))))
         """Pixels per ground unit at the target."""
         self.appearance = AppearanceModel(*self._box, 1.0 / self.scale)
@@ -54,6 +59,7 @@ class Target:
         self._typical_score = 1.0
         self._learnt_share = 0.0  # visible share when it was learnt
         self._learn(image, 1.0)
+        self._orient(image)
 
     @property
     def length(self) -> float:
@@ -103,12 +109,36 @@ class Target:
         patch = self.patch(image, centre, half, angle)
         return [] if patch is None else self.appearance.candidates(patch)
 
+    def _orient(self, image: Image) -> None:
+        """Turn the patch to the body's axis where the colours in the box show it: its corners are then background."""
+        patch = self.patch(image, self.position, 0.6)
+        if patch is None or not patch.complete:
+            return
+        ratio = self.appearance.colour_log_ratios(patch.cells)
+        rows, columns = np.indices(ratio.shape)
+        cells = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
+        local = (cells - patch.to_cells(self.position[None])) * patch.cell_size
+        found = footprint.oriented_rectangle(local, ratio.ravel().astype(np.float64), self._box)
+        if found is not None:
+            turn, length, width = found
+            self.angle, self._oriented = self.angle + turn, True
+            self.appearance.reshape(length, width)
+            self._learn(image, 1.0)
+
     def align(self, image: Image, fit: MotionFit) -> None:
         """Change from the box as drawn to the car's length and width, once its heading is known."""
-        self.appearance.reshape(*footprint.footprint_from_box(*self._box, fit.heading - self.angle))
+        crab = (self.angle - fit.heading + 0.5 * np.pi) % np.pi - 0.5 * np.pi  # of an axis, which has no front
+        self.crab_angle = float(crab) if self._oriented and abs(crab) > _MAX_BODY_ERROR else 0.0
+        if not self.crab_angle:
+            self.appearance.reshape(*footprint.footprint_from_box(*self._box, fit.heading - self._box_angle))
         self._localiser.target_height = _CENTRE_HEIGHT_RATIO * self.length
-        self.angle, self.aligned = fit.heading, True
+        self.angle, self.aligned = fit.heading + self.crab_angle, True
         self._learn(image, 1.0)
+
+    def update_crab_angle(self, best: Candidate, course: float) -> None:
+        """Take the body's angle from a certain, complete detection that matches at another angle than the course."""
+        if self.appearance.shape_matches(best):
+            self.crab_angle = float((best.angle - course + np.pi) % (2.0 * np.pi) - np.pi)
 
     def relearn_if_more_visible(self, image: Image, best: Candidate) -> None:
         """Learn a target again that was cut by the image border at first, as more of it becomes visible."""
@@ -130,14 +160,15 @@ class Target:
         """Adapt the appearance slightly to a certain, complete detection."""
         patch = self.patch(image, best.ground, 1.6)
         if patch is not None:
-            self.appearance.learn(patch, best.ground, _LEARNING_RATE)
+            self.appearance.learn(patch, best.ground, _LEARNING_RATE, self.aligned)
         self.appearance.calibrate(best.colour, best.shape, 0.05)
 
     def change_frame(self, position: Floats, jacobian: Floats) -> None:
         """Transform to another ground frame: (2,) new position, (2, 2) derivative there of new by old ground."""
         factor = float(np.sqrt(abs(np.linalg.det(jacobian))))
-        direction = jacobian @ np.array([np.cos(self.angle), np.sin(self.angle)])
-        self.angle = float(np.arctan2(direction[1], direction[0]))
+        for name in ("angle", "_box_angle"):
+            direction = jacobian @ np.array([np.cos(getattr(self, name)), np.sin(getattr(self, name))])
+            setattr(self, name, float(np.arctan2(direction[1], direction[0])))
         self._box = (self._box[0] * factor, self._box[1] * factor)
         self.appearance.rescale(factor)
         self._localiser.target_height = _CENTRE_HEIGHT_RATIO * self.length
@@ -146,7 +177,7 @@ class Target:
 
     def outline(self, position: Floats, heading: float, enlarged: float = 1.0) -> Floats:
         """(4, 2) ground corners of the footprint about a position, scaled by ``enlarged``."""
-        orientation = heading if self.aligned else self.angle
+        orientation = heading + self.crab_angle if self.aligned else self.angle
         return footprint.corners(
             position, orientation, enlarged * self.appearance.length, enlarged * self.appearance.width
         )
@@ -157,7 +188,7 @@ class Target:
             return
         if rate >= 1.0:
             self.appearance.reset()
-        self.appearance.learn(patch, self.position, rate)
+        self.appearance.learn(patch, self.position, rate, self.aligned)
         self.local_gain.set_reference(self.appearance.log_brightness(patch, self.position))
         candidates = self.appearance.candidates(patch, min_score=-1.0)
         near = [c for c in candidates if np.linalg.norm(c.ground - self.position) < 0.3 * self.length]

@@ -19,7 +19,7 @@ from edge.uav.prediction.driver_model import DriverModel
 from edge.uav.prediction.particle_set import NO_PATH
 from edge.uav.prediction.paths import RoadPath, road_edges, trace_paths
 from edge.uav.target.appearance import AppearanceModel, Candidate, GroundPatch, rectify_patch
-from edge.uav.target.footprint import corners, footprint_from_box
+from edge.uav.target.footprint import corners, footprint_from_box, oriented_rectangle
 from edge.uav.target.likelihood import evaluate_candidates
 from edge.uav.target.motion_history import MotionFit, MotionHistory
 from edge.uav.target.redetection import path_plausibility
@@ -113,6 +113,30 @@ def test_the_length_of_a_car_is_recovered_from_its_upright_box(length: float, wi
     box = np.ptp(corners(np.zeros(2), turn, length, width), axis=0)
     found, _ = footprint_from_box(float(box[0]), float(box[1]), turn)
     assert found == pytest.approx(length, rel=0.2)
+
+
+@pytest.mark.parametrize("turn", [-1.2, -0.6, 0.3, 0.8])
+def test_a_turned_rectangle_is_found_in_its_upright_box(turn: float) -> None:
+    box = np.ptp(corners(np.zeros(2), turn, 4.4, 1.8), axis=0)
+    points = np.stack(np.meshgrid(*2 * [np.linspace(-3.0, 3.0, 41)]), axis=-1).reshape(-1, 2)
+    axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    inside = (np.abs(points @ axes) <= [2.2, 0.9]).all(axis=1)
+    evidence = np.where(inside, 2.0, 0.3) + np.random.default_rng(1).normal(0.0, 0.4, len(points))
+    found = oriented_rectangle(points, evidence, (float(box[0]), float(box[1])))
+    assert found is not None
+    assert abs(np.sin(found[0] - turn)) < 0.1
+    assert found[1] == pytest.approx(4.4, rel=0.1)
+    assert oriented_rectangle(points, np.where(np.hypot(*points.T) < 1.5, 2.0, -1.0), (3.0, 3.0)) is None
+
+
+def test_the_shape_of_a_target_as_bright_as_the_ground_is_not_that_of_the_ground() -> None:
+    empty = np.random.default_rng(4).normal((60, 80, 77), 12, (240, 320, 3)).clip(0, 255).astype(np.uint8)
+    image = empty.copy()
+    image[110:130, 140:184] = (30, 30, 185)  # brightness 76, that of the ground 77
+    appearance = appearance_of(image, 161.5, 119.5)
+    left = appearance.candidates(patch_of(empty, 161.5, 119.5), min_score=-1.0)
+    there = [c.shape for c in left if np.linalg.norm(c.ground - ground_of(161.5, 119.5)) < 1.0]
+    assert max(there, default=0.0) < 0.3
 
 
 def test_a_photometric_gain_is_estimated_and_corrected() -> None:

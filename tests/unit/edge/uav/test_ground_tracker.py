@@ -10,8 +10,10 @@ import numpy.typing as npt
 import pytest
 
 from edge.uav.base import Box, Estimate, Telemetry, TrackState
+from edge.uav.ground_tracker import GroundTracker
 from edge.uav.tracker_factory import make_tracker
 from edge.uav.world import scenarios
+from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Image
@@ -90,6 +92,35 @@ def test_a_car_in_view_is_tracked_within_pixels(background: Image) -> None:
     assert abs(found[-1].heading) < 0.1
     assert found[-1].width == pytest.approx(CAR[0], rel=0.2)
     assert np.isnan(found[-1].north)
+
+
+@pytest.mark.parametrize(("turn", "course", "colour"), [(0.7, 2.2, (40, 40, 210)), (-0.4, -0.4, (60, 50, 190))])
+def test_a_plain_target_over_textured_ground_is_tracked_whichever_way_it_points(
+    turn: float, course: float, colour: tuple[int, int, int]
+) -> None:
+    """It was lost: corners of the box, its ring and a brightness as the ground's held the template to the ground."""
+    rng = np.random.default_rng(5)
+    layers = (
+        cv2.resize(rng.normal(0, 22, (240 // n, 320 // n, 3)), SIZE, interpolation=cv2.INTER_CUBIC) for n in (4, 16)
+    )
+    ground = 100.0 + sum(layers)
+    matrix = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
+    tracker = GroundTracker(SIZE, Intrinsics(*SIZE, matrix), BODY_FROM_DOWN_CAMERA, FPS, 0)
+    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    body = np.array([[22, 9], [22, -9], [-22, -9], [-22, 9]]) @ axes
+    size = np.ptp(body, axis=0) + 4.0
+    for i in range(60):
+        centre = np.array([160.0, 120.0]) + (i - 30) * 2.0 * np.array([np.cos(course), np.sin(course)])
+        image = np.clip(ground, 0, 255).astype(np.uint8)
+        cv2.fillConvexPoly(image, np.round(16 * (centre + body)).astype(np.int32), colour, cv2.LINE_AA, 4)
+        image = np.clip(image + np.random.default_rng(i).normal(0, 3, image.shape), 0, 255).astype(np.uint8)
+        tracker.handle_telemetry(Telemetry(i / FPS, np.eye(3), np.array([0.0, 0.0, -30.0])))
+        if i == 0:
+            found = tracker.begin(image, 0.0, Box(*(centre - size / 2), *size))
+        else:
+            found = tracker.handle_frame(image, i / FPS)
+        assert found.state is TrackState.VISIBLE, i
+        assert np.hypot(found.x - centre[0], found.y - centre[1]) < 6.0, i
 
 
 def test_a_car_that_leaves_the_image_coasts_and_is_reacquired_when_the_camera_follows(background: Image) -> None:
