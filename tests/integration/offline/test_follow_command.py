@@ -97,7 +97,8 @@ def test_a_log_of_the_boxes_is_followed_and_replayed(session: Path, followed: Pa
         assert isinstance(logged.message, pb.Track)
         last[logged.message.label] = logged.message
     assert len([track for track in last.values() if track.state == "confirmed"]) == 3
-    wrong, other = write_calibration(tmp_path / "mm.toml", scale=1000.0), tmp_path / "other.mcap"
+    wrong = write_calibration(tmp_path / "mm.toml", scale=1000.0, offsets=OFFSETS)
+    other = tmp_path / "other.mcap"
     assert run(["replay", str(log), "--through", "hub", "--calibration", str(wrong), "--out", str(other)]) == 2
     assert not other.exists()
 
