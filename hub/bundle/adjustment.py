@@ -227,7 +227,7 @@ def minimise(
         linear = float(system.gradient_path @ path_step + system.gradient_cameras @ camera_step)
         gain = cost - trial_residuals.cost
         ratio = gain / max(damping * curved - linear, 1e-300)
-        if np.isfinite(gain) and ratio < _FAR:
+        if np.isfinite(gain) and linear < 0.0 and ratio < _FAR:
             share = linear / (gain + 2.0 * linear)
             shorter = apply_step(problem, state, share * path_step, share * camera_step)
             residuals = weigh_residuals(problem, shorter, prior, robust)

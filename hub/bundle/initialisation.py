@@ -309,6 +309,8 @@ def _subsampled(problem: Problem, state: AdjustmentState) -> Problem:
 def knot_spacing(cameras: list[CameraInput], label: str, large: bool = False) -> float:
     """Knot spacing [s] of a label's trajectory: the finest by the tracks' cross-validation, or half of it.
 
+    large: of a network of many cameras.
+
     Of few frames a knot in each track these, not the motion, limit what it follows; the path has other cameras' too.
     What it does not follow all joints of a body do alike, which biases clocks: those of two walkers at 10 to 15 frames
     a second by up to 5000 ppm, also at true poses; by 500 with half. With six, as of drones, nothing is gained, but

@@ -477,3 +477,14 @@ def test_steps_that_go_too_far_are_cut_to_the_parabola_s_minimum() -> None:
     steps: list[AdjustmentStep] = []
     minimise(problem, state, prior, False, 100, 1e-9, steps, False)
     assert len(steps) < 30
+
+
+def test_where_nothing_pulls_the_state_stays() -> None:
+    """Without rows in use or a prior the step is exactly 0: no parabola goes through it."""
+    problem, state, prior = simulated_problem(3, lens=False)
+    problem = replace(problem, rows=tuple(rows.using(np.zeros_like(rows.use)) for rows in problem.rows))
+    prior = replace(prior, weights=tuple(0.0 * one for one in prior.weights))
+    kept = replace(problem, free_parameters=FreeParameters(pose=False, clock=False))
+    found = minimise(kept, state, prior, False, 5, 1e-9, [], False)
+    for before, after in zip(state.trajectories, found.trajectories, strict=True):
+        np.testing.assert_array_equal(before.control, after.control)
