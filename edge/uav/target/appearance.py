@@ -27,7 +27,7 @@ _MIN_TARGET_CELLS = 12.0  # the same, at least: cells of 0.4 m still tell a car'
 _MAX_PATCH_CELLS = 200  # per side
 _MIN_SHAPE_RATIO = 0.75  # to the typical shape response: the same car under other illumination
 _BRIGHTNESS = np.array([0.114, 0.587, 0.299])  # of blue, green and red, as in OpenCV's grey
-_MIN_BRIGHTNESS_CONTRAST = 1.0  # squared, in variances of the background: below, it is as bright as the ground
+_MIN_BRIGHTNESS_CONTRAST = 4.0  # squared, in variances of the background: two stds stand out from a patterned ground
 _MIN_VISIBLE_SHARE = 0.3  # of the footprint inside the image
 
 
