@@ -127,7 +127,7 @@ def one_place(seed: int) -> rigs.Session:
     """Two cameras hang in one place."""
     session = rigs.simulate(seed, 2, seconds=20.0)
     rng = np.random.default_rng([seed, 9])
-    pose = rigs.looking_at(session.poses["cam0"].position, rng.normal(0, 0.15, 3), 0.3)
+    pose = rigs.look_at_pose(session.poses["cam0"].position, rng.normal(0, 0.15, 3), 0.3)
     lens = session.rig.cameras["cam1"].intrinsics
     assert lens is not None
     mine = np.flatnonzero([name == "cam1" for name in session.camera])

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from edge.scenes.common.placement import look_at_pose
 from hub.two_view.relative_pose import RelativePose, fundamental_from, orthogonal_axes, relative_pose_between
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
-from tests.support.rigs import looking_at
 
 FOCAL = 700.0
 SIZE = (800, 600)
@@ -233,7 +233,7 @@ def _random_rig(rng: np.random.Generator) -> tuple[Pose, Pose]:
         if 30.0 <= np.rad2deg(np.arccos(directions[0] @ directions[1])) <= 150.0:
             break
     return tuple(  # type: ignore[return-value]
-        looking_at(direction * rng.uniform(500, 900), rng.normal(0, 15, 3), rng.normal(0, 0.15))
+        look_at_pose(direction * rng.uniform(500, 900), rng.normal(0, 15, 3), rng.normal(0, 0.15))
         for direction in directions
     )
 

@@ -23,6 +23,7 @@ from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION, STATUS
 from tests.faults.matrix import measured
+from tests.faults.processes import wait_until
 
 PERIOD_S = 1 / 30
 
@@ -95,12 +96,12 @@ def test_a_camera_without_usable_frames_is_reported_and_publishes_nothing_stale(
 
         return check
 
-    _until(has_received(lambda status: status.state == "running"))
+    wait_until(has_received(lambda status: status.state == "running"))
     time.sleep(0.5)
     assert len(observations.drain()) > 5
     device.flaw.set()
     began = time.monotonic()
-    seconds = _until(has_received(lambda status: status.state == "degraded" and words in status.message))
+    seconds = wait_until(has_received(lambda status: status.state == "degraded" and words in status.message))
     time.sleep(1.0)
     stale = [
         item.message
@@ -110,7 +111,7 @@ def test_a_camera_without_usable_frames_is_reported_and_publishes_nothing_stale(
     if kind not in ("stalled", "unplugged"):
         received.clear()
         device.flaw.clear()
-        _until(has_received(lambda status: status.state == "running"))
+        wait_until(has_received(lambda status: status.state == "running"))
         assert len(observations.drain()) >= 0
     stop.set()
     agent.join(10.0)
@@ -176,7 +177,7 @@ def test_a_network_camera_that_was_unplugged_comes_back_in_the_same_run_of_its_a
         received.extend(item.message for item in statuses.drain())  # type: ignore[misc]
 
     def until(condition: Callable[[], bool]) -> float:
-        return _until(lambda: (check(), condition())[1])  # type: ignore[func-returns-value]
+        return wait_until(lambda: (check(), condition())[1])  # type: ignore[func-returns-value]
 
     try:
         until(lambda: len(seen) > 25)
@@ -226,11 +227,3 @@ def test_a_camera_that_is_gone_for_good_ends_its_agent_with_the_reason() -> None
 
 def _run(device: Flawed, bus: MemoryBus, stop: threading.Event) -> None:
     CameraAgent(device, Bright(), bus, "cam0").run(stop)
-
-
-def _until(condition: Callable[[], bool], timeout_s: float = 10.0) -> float:
-    began = time.monotonic()
-    while not condition():
-        assert time.monotonic() - began < timeout_s
-        time.sleep(0.01)
-    return time.monotonic() - began

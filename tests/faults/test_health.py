@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import time
 import urllib.error
@@ -26,17 +25,12 @@ CAMERAS = ("cam0", "cam1", "cam2")
 LIMIT_S = 5.0
 
 
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
-
-
 class Site:
     """Router, recorder, hub and three simulated cameras as processes, asked over HTTP."""
 
     def __init__(self, folder: Path, disk: Path) -> None:
         self.folder, self.endpoint = folder, free_endpoint()
-        self.ports = {name: _free_port() for name in ("router", "recorder", "hub", *CAMERAS)}
+        self.ports = {name: int(free_endpoint().rpartition(":")[2]) for name in ("router", "recorder", "hub", *CAMERAS)}
         self.processes: dict[str, Process] = {}
         self._own = {
             "router": "",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edge.scenes.common.placement import look_at_pose
 from protocols.core.clocks import CameraTime, ReferenceTime, TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
@@ -114,15 +115,6 @@ def random_path(rng: np.random.Generator, fastest: float = 0.7, extent: float = 
     return Path(frequency, rng.uniform(0, 2 * np.pi, (5, 3)), amplitude)
 
 
-def looking_at(position: Floats, target: Floats, roll: float = 0.0) -> Pose:
-    """A camera at ``position`` whose axis goes through ``target``; world z up."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Pose(so3.exp(np.array([0.0, 0.0, roll])) @ rotation, position)
-
-
 def random_lens(rng: np.random.Generator, fisheye: bool = False) -> Intrinsics:
     """A lens with distortion that still has an inverse over the whole image."""
     focal = rng.uniform(0.75, 1.0) * SIZE[0]
@@ -140,7 +132,7 @@ def random_poses(rng: np.random.Generator, count: int) -> list[Pose]:
     azimuth = np.deg2rad(np.cumsum(steps)) + rng.uniform(0, 2 * np.pi)
     radius, height = rng.uniform(4.0, 6.0, count), rng.uniform(-0.5, 2.5, count)
     places = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
-    return [looking_at(place, rng.normal(0, 0.15, 3), rng.normal(0, 0.1)) for place in places]
+    return [look_at_pose(place, rng.normal(0, 0.15, 3), rng.normal(0, 0.1)) for place in places]
 
 
 def simulate(

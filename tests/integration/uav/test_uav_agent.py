@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import threading
 import time
 import urllib.request
@@ -19,6 +18,7 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 
 from deploy.agents import uav
+from deploy.agents.processes import free_udp_port
 from deploy.config.file import load
 from deploy.config.uav import SimulatedFlightConfig, UavConfig
 from edge.mavlink.roles.autopilot import DEFAULT_ORIGIN
@@ -29,12 +29,6 @@ from tests.support.samples import eventually
 
 M = mavutil.mavlink
 ACTIVE, ERROR, COASTING = 1, 2, 8
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Gcs:
@@ -73,7 +67,7 @@ class Gcs:
 @contextmanager
 def agent(tmp_path: Path, text: str = "") -> Iterator[tuple[Gcs, FlightWorld, Any, UavConfig]]:
     """A running agent on a memory bus: station, world, subscriptions by topic, configuration."""
-    port = free_port()
+    port = free_udp_port()
     file = tmp_path / "drone.toml"
     file.write_text(
         f'id = "drone"\n[simulated]\nautopilot = "127.0.0.1:{port}"\nseconds = 60\nseed = 3\n'

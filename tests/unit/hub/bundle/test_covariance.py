@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from edge.scenes.common.placement import look_at_pose
 from hub.bundle import covariance as cov
 from hub.bundle.adjustment import adjust
 from hub.bundle.block_matrix import BlockSum, DenseCovariance
@@ -24,7 +25,7 @@ from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.calibration.pipeline import calibrate
 from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
-from tests.support.rigs import looking_at, random_lens, random_path, random_poses, simulate
+from tests.support.rigs import random_lens, random_path, random_poses, simulate
 from tests.unit.hub.bundle.test_adjustment import simulated_problem
 
 RUNS, SECONDS = 40, 12.0
@@ -201,7 +202,7 @@ def test_the_smoothness_of_a_path_does_not_hold_its_depth() -> None:
     lenses = [random_lens(rng) for _ in range(2)]
     places = (np.array([5.0, 0.0, 0.0]), np.array([5.0, 0.2, 0.0]))
     cameras = tuple(
-        CameraState(lens, looking_at(place, np.zeros(3)), 1.0, 10.0, 10.0)
+        CameraState(lens, look_at_pose(place, np.zeros(3)), 1.0, 10.0, 10.0)
         for lens, place in zip(lenses, places, strict=True)
     )
     basis = SplineBasis.covering(np.array([0.0]), np.array([20.0]), 0.3)
