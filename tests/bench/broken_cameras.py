@@ -142,17 +142,8 @@ def recorded(folder: Path) -> rigs.Session:
 
 def without(session: rigs.Session, name: str) -> rigs.Session:
     """The session without a camera."""
-    keep = np.flatnonzero([one != name for one in session.camera])
     cameras = {one: camera for one, camera in session.rig.cameras.items() if one != name}
-    return replace(
-        session,
-        rig=replace(session.rig, cameras=cameras),
-        camera=[session.camera[i] for i in keep],
-        label=[session.label[i] for i in keep],
-        frame=session.frame[keep],
-        time=session.time[keep],
-        pixels=session.pixels[keep],
-    )
+    return replace(session, rig=replace(session.rig, cameras=cameras)).where(~session.of_camera(name))
 
 
 def timed(session: rigs.Session) -> tuple[Calibration, float]:
@@ -204,7 +195,7 @@ def main() -> None:
         tasks = [(number, real, number) for number in range(len(real.rig.cameras))]
     for seed, session, number in tasks:
         name = list(session.rig.cameras)[number]
-        mine = np.array([one == name for one in session.camera])
+        mine = session.of_camera(name)
         before, base = timed(without(session, name))
         whole = timed(session)[1]
         print(f"rig {seed}: {base:.1f} s CPU without {name}, {whole:.1f} s with it", flush=True)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
 
 import numpy as np
 
@@ -31,9 +30,8 @@ def main() -> int:
     for seed in range(given.start, given.start + given.sessions):
         session = simulate(seed, given.cameras, 30.0)
         lenses = {name: camera.intrinsics for name, camera in session.rig.cameras.items()}
-        blind = {name: replace(camera, intrinsics=None) for name, camera in session.rig.cameras.items()}
         try:
-            found = calibrate(replace(session.rig, cameras=blind), session.observations())
+            found = calibrate(session.without_lenses().rig, session.observations())
         except Refused as refusal:
             print(f"{seed}: refused: {refusal.reason}")
             refused += given.cameras

@@ -137,15 +137,7 @@ def _bumped(session: rigs.Session, at: float, rng: np.random.Generator) -> tuple
     pixels = session.pixels.copy()
     pixels[after] += lens.project(new.camera_from_world(points)) - lens.project(old.camera_from_world(points))
     inside = np.all((pixels >= 0) & (pixels < rigs.SIZE), axis=1)
-    kept = np.flatnonzero(inside)
-    moved = replace(
-        session,
-        camera=[session.camera[i] for i in kept],
-        label=[session.label[i] for i in kept],
-        frame=session.frame[kept],
-        time=session.time[kept],
-        pixels=pixels[kept],
-    )
+    moved = replace(session, pixels=pixels).where(inside)
     return Bump(BUMPED, at, {**session.poses, BUMPED: new}), moved
 
 

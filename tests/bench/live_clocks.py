@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -108,17 +108,9 @@ def window(seeds: range) -> None:
         hub.tick(1e3, final=True)
         keep = np.zeros(len(session.time), dtype=np.bool_)
         for name in session.rig.cameras:
-            mine = np.array([camera == name for camera in session.camera])
+            mine = session.of_camera(name)
             keep |= mine & (session.time >= session.time[mine].max() - WINDOW_S)
-        at = np.flatnonzero(keep)
-        late = replace(
-            session,
-            camera=[session.camera[i] for i in at],
-            label=[session.label[i] for i in at],
-            frame=session.frame[at],
-            time=session.time[at],
-            pixels=session.pixels[at],
-        )
+        late = session.where(keep)
         try:
             found = calibrate(session.rig, late.observations())
         except Refused:

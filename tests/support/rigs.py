@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import pathlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from protocols.core.clocks import CameraTime, ReferenceTime, TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
-from protocols.geometry.types import Floats, Ints
+from protocols.geometry.types import Bools, Floats, Ints
+from protocols.session.folder import write_observations
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
 
@@ -65,6 +67,42 @@ class Session:
             np.full(len(o), np.nan),
             order=self.rig.cameras,
         )
+
+    def where(self, keep: Bools) -> Session:
+        """The session with the rows (n,) to keep only."""
+        at = np.flatnonzero(keep)
+        return replace(
+            self,
+            camera=[self.camera[i] for i in at],
+            label=[self.label[i] for i in at],
+            frame=self.frame[at],
+            time=self.time[at],
+            pixels=self.pixels[at],
+        )
+
+    def of_camera(self, name: str) -> Bools:
+        """(n,) the rows of a camera."""
+        return np.array([camera == name for camera in self.camera])
+
+    def without_lenses(self, *names: str) -> Session:
+        """The session without the intrinsics of ``names``, or of all; their distortion stays in the pixels."""
+        cameras = {
+            name: replace(camera, intrinsics=None) if name in names or not names else camera
+            for name, camera in self.rig.cameras.items()
+        }
+        return replace(self, rig=replace(self.rig, cameras=cameras))
+
+    def write(self, folder: pathlib.Path, metadata: str = "") -> pathlib.Path:
+        """The session as a new folder. metadata: lines of that table."""
+        folder.mkdir()
+        text = f"[metadata]\n{metadata}\n" if metadata else ""
+        for name, camera in self.rig.cameras.items():
+            text += f'[{name}]\nname = "{name}"\nsize = {list(camera.size)}\nfps = {camera.fps}\n'
+            if (lens := camera.intrinsics) is not None:
+                text += f"matrix = {lens.matrix.tolist()}\ndistortions = {lens.distortions.tolist()}\n"
+        (folder / "rig.toml").write_text(text)
+        write_observations(folder / "observations.csv", self.observations())
+        return folder
 
     def csv(self) -> str:
         """The rows as observations.csv."""

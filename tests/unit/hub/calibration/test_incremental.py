@@ -158,7 +158,7 @@ def test_a_moved_camera_is_found_again_where_it_stands(shift_m: float, turn_rad:
     lens = session.rig.cameras["cam2"].intrinsics
     assert lens is not None
     true = np.array([session.true_time(c, t) for c, t in zip(session.camera, session.time, strict=True)])
-    rows = np.array([c == "cam2" for c in session.camera]) & (true > 30.0)
+    rows = session.of_camera("cam2") & (true > 30.0)
     path = session.paths["marker"].at(true[rows])
     pixels = session.pixels.copy()
     old, new = lens.project(pose.camera_from_world(path)), lens.project(moved.camera_from_world(path))
@@ -271,7 +271,7 @@ def test_arrival_priors_need_steady_delays() -> None:
 def test_a_clock_step_inside_the_window_is_recognised_and_the_map_is_that_after_it(camera: str, size: float) -> None:
     """It is no move of the camera, and the time that is published does not step with the reference camera's clock."""
     session = simulate(2, 3, 45)
-    mine = np.array([name == camera for name in session.camera])
+    mine = session.of_camera(camera)
     at = float(np.quantile(session.time[mine], 0.6))
     begin = session.true_time(camera, at)
     stepped = replace(session, time=session.time + np.where(mine & (session.time >= at), size, 0.0))
@@ -297,7 +297,7 @@ def test_a_clock_step_inside_the_window_is_recognised_and_the_map_is_that_after_
 
 def test_the_first_answer_of_a_window_with_a_clock_step_holds_after_it() -> None:
     session = simulate(1, 4, 40)
-    mine = np.array([name == "cam2" for name in session.camera])
+    mine = session.of_camera("cam2")
     at = float(np.quantile(session.time[mine], 0.8))
     stepped = replace(session, time=session.time + np.where(mine & (session.time >= at), 0.03, 0.0))
     found = update_calibration(session.rig, stepped.observations(), None).calibration
