@@ -141,7 +141,7 @@ def test_not_utf8_is_reported(tmp_path: Path) -> None:
 
 
 def test_an_empty_file_is_reported(tmp_path: Path) -> None:
-    assert_reported(tmp_path, "", 1, "column")
+    assert_reported(tmp_path, "", 1, "empty")
 
 
 def test_a_header_alone_is_reported(tmp_path: Path) -> None:
