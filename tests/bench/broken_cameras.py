@@ -11,7 +11,6 @@ lag, in its stated stds. Requirement: at most twice the CPU without it, named, c
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,6 +23,7 @@ from protocols.geometry import so3
 from protocols.geometry.types import Bools
 from protocols.session.calibration import Calibration
 from protocols.session.folder import read_folder
+from tests.bench.options import bench_parser
 from tests.support import rigs
 
 Breakage = Callable[[rigs.Session, str, Bools, np.random.Generator], rigs.Session]
@@ -51,8 +51,7 @@ def another_recording(session: rigs.Session, name: str, mine: Bools, random: np.
         return replace(session, pixels=pixels)
     other = rigs.random_path(np.random.default_rng([7, int(random.integers(1 << 30))]))
     true = np.array([session.true_time(name, float(t)) for t in session.time[mine]])
-    lens = session.rig.cameras[name].intrinsics
-    assert lens is not None
+    lens = session.lens(name)
     pixels = session.pixels.copy()
     pixels[mine] = lens.project(session.poses[name].camera_from_world(other.at(true)))
     return replace(session, pixels=np.nan_to_num(pixels, nan=0.0))
@@ -179,13 +178,7 @@ def names(found: Calibration, name: str) -> bool:
 
 def main() -> None:
     """Print one line a rig and breakage."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cameras", type=int, default=7)
-    parser.add_argument("--seconds", type=float, default=40.0)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--session", type=Path)
-    options = parser.parse_args()
+    options = bench_parser(__doc__, cameras=7, seconds=40.0, seeds=3, first=0, session=Path).parse_args()
     ratios, bad = [], []
     if options.session is None:
         seeds = range(options.first, options.first + options.seeds)
