@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import threading
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from tests.support.samples import eventually
 pytest.importorskip("cryptography", reason="the extra `keys` is not installed: access rules are not tested")
 from deploy.site.keys import issue, make_site
 from tests.support.links import poisoned, through_a_link
+from tests.support.threads import looping
 
 SITE = "test"
 
@@ -157,19 +157,9 @@ def test_a_router_without_rules_is_detected(keys: tuple[Path, str]) -> None:
         assert (speaks.verdict, "publish for others" in speaks.text) == ("fail", True)
         assert "zenoh.json5" in speaks.remedy
 
-        enough = threading.Event()
-
-        def talk() -> None:
-            while not enough.wait(0.1):
-                publisher.put(pb.AgentStatus(schema_version=1, agent="hub", role="hub", boot_id="b", state="running"))
-
-        thread = threading.Thread(target=talk)
-        thread.start()
-        try:
+        speech = pb.AgentStatus(schema_version=1, agent="hub", role="hub", boot_id="b", state="running")
+        with looping(lambda: publisher.put(speech), 0.1):
             hears = agent.access_rights(camera, SITE, "camera", "cam0", seconds=3.0)
-        finally:
-            enough.set()
-            thread.join()
         assert (hears.verdict, "receives messages that it may not receive" in hears.text) == ("fail", True)
 
 

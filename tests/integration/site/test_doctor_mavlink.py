@@ -18,8 +18,8 @@ from deploy.site.doctor.check_result import CheckResult
 from edge.mavlink.dialect import mavlink as M
 from edge.mavlink.link.signing import Signing
 from edge.mavlink.link.transport import Udp, Url
+from tests.support.threads import looping
 from tests.support.vehicle_link import autopilot as simulated_autopilot
-from tests.support.vehicle_link import looping
 
 
 def examine(url: str, patience_s: float = 0.5, **options: Any) -> list[CheckResult]:

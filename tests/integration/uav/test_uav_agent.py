@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from edge.uav.world.flight_world import FlightWorld
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.topics import TOPICS
 from tests.support.samples import eventually
+from tests.support.threads import running
 
 M = mavutil.mavlink
 ACTIVE, ERROR, COASTING = 1, 2, 8
@@ -78,17 +78,8 @@ def agent(tmp_path: Path, text: str = "") -> Iterator[tuple[Gcs, FlightWorld, An
     hub = MemoryHub()
     listener = MemoryBus(hub)
     subscriptions = {topic.name: listener.subscribe(topic) for topic in TOPICS}
-    stop = threading.Event()
-    thread = threading.Thread(target=uav.start_uav, args=(config, MemoryBus(hub), stop))
-    thread.start()
-    gcs = Gcs(port)
-    try:
+    with running(lambda stop: uav.start_uav(config, MemoryBus(hub), stop)), closing(Gcs(port)) as gcs:
         yield gcs, world, subscriptions, config
-    finally:
-        stop.set()
-        thread.join(20.0)
-        gcs.close()
-        assert not thread.is_alive()
 
 
 _WORLDS: dict[int, Any] = {}
