@@ -128,8 +128,7 @@ def one_place(seed: int) -> rigs.Session:
     session = rigs.simulate(seed, 2, seconds=20.0)
     rng = np.random.default_rng([seed, 9])
     pose = rigs.look_at_pose(session.poses["cam0"].position, rng.normal(0, 0.15, 3), 0.3)
-    lens = session.rig.cameras["cam1"].intrinsics
-    assert lens is not None
+    lens = session.lens("cam1")
     mine = np.flatnonzero(session.of_camera("cam1"))
     true = np.array([session.true_time("cam1", float(t)) for t in session.time[mine]])
     pixels = session.pixels.copy()

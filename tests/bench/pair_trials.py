@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edge.scenes.common.placement import look_at_pose
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from hub.two_view.relative_pose import RelativePose, fundamental_from, orthogonal_axes, relative_pose_between
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
@@ -52,6 +53,11 @@ class Trial:
     def true(self, camera: int, shown: Floats) -> Floats:
         """True times (n,) at which a camera's clock shows ``shown``."""
         return (shown - self.clock_offset[camera]) / self.clock_rate[camera]
+
+    def smoothed(self) -> list[SmoothTrack]:
+        """The tracks of both cameras; fewer where one of them is none."""
+        found = [smooth_track(view.time, (view.pixels - MATRIX[:2, 2]) / FOCAL, FOCAL) for view in self.views]
+        return [track for track in found if track is not None]
 
     @property
     def overlap(self) -> tuple[float, float]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edge.scenes.common.placement import look_at_pose
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from protocols.core.clocks import CameraTime, ReferenceTime, TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
@@ -83,6 +84,37 @@ class Session:
     def of_camera(self, name: str) -> Bools:
         """(n,) the rows of a camera."""
         return np.array([camera == name for camera in self.camera])
+
+    @property
+    def true(self) -> Floats:
+        """(n,) true times of the rows."""
+        return np.array([self.true_time(name, float(t)) for name, t in zip(self.camera, self.time, strict=True)])
+
+    def moved(self, name: str, since: float, pose: Pose) -> Session:
+        """The session with a camera at another pose from a true time on; each row keeps its noise."""
+        rows, lens, pixels = self.of_camera(name) & (self.true > since), self.lens(name), self.pixels.copy()
+        points = self.paths[DEFAULT_LABEL].at(self.true[rows])
+        pixels[rows] += lens.project(pose.camera_from_world(points))
+        pixels[rows] -= lens.project(self.poses[name].camera_from_world(points))
+        return replace(self, pixels=pixels, poses={**self.poses, name: pose})
+
+    def turned(self, name: str, since: float, angle: float) -> Session:
+        """The session with a camera turned by an angle [rad] about its vertical axis from a true time on."""
+        pose = self.poses[name]
+        return self.moved(name, since, replace(pose, rotation=so3.exp(np.array([0.0, angle, 0.0])) @ pose.rotation))
+
+    def lens(self, name: str) -> Intrinsics:
+        """The intrinsics of a camera that has some."""
+        found = self.rig.cameras[name].intrinsics
+        assert found is not None
+        return found
+
+    def smoothed(self, name: str) -> dict[str, SmoothTrack]:
+        """A camera's tracks by label, all with one time origin."""
+        own, lens = self.observations().of_camera(name), self.lens(name)
+        begin = min(float(track.time[0]) for track in own)
+        found = {t.label: smooth_track(t.time, lens.unproject(t.pixels), lens.focal, begin) for t in own}
+        return {label: track for label, track in found.items() if track is not None}
 
     def without_lenses(self, *names: str) -> Session:
         """The session without the intrinsics of ``names``, or of all; their distortion stays in the pixels."""

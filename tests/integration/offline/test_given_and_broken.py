@@ -79,8 +79,7 @@ def test_a_focal_length_with_a_std_is_an_observation_of_that_weight(solver: str)
         wrong = with_focal(wrong, name, factor)
     found = calibrate(wrong.rig, wrong.observations(), solver=solver)
     for name, camera in found.cameras.items():
-        lens = session.rig.cameras[name].intrinsics
-        assert lens is not None
+        lens = session.lens(name)
         assert abs(camera.intrinsics.focal / lens.focal - 1.0) < 4.0 * camera.focal_std < 0.02
         assert np.array_equal(camera.intrinsics.distortions, lens.distortions)
         assert [one.std for one in camera.sensitivities] == [0.01]

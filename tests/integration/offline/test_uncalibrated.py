@@ -54,8 +54,7 @@ def epipolar_px(full: Session, session: Session, pair: dict[str, Any]) -> float:
     points = full.paths["marker"].at(np.linspace(3.0, 17.0, 80))
     seen: list[Floats] = []
     for name in pair["cameras"]:
-        lens = full.rig.cameras[name].intrinsics
-        assert lens is not None
+        lens = full.lens(name)
         local = full.poses[name].camera_from_world(points)
         straight = (local / local[:, 2:] @ lens.matrix.T)[:, :2]
         pixels = lens.project(local) if session.rig.cameras[name].intrinsics is None else straight

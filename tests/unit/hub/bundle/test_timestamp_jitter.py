@@ -90,8 +90,7 @@ def test_correlated_errors_are_not_reported_as_jitter() -> None:
     time = session.time[mine]
     late = 0.02 * np.sin(2 * np.pi * (time - time[0]) / 1.5)
     label = session.label[int(np.flatnonzero(mine)[0])]
-    lens = session.rig.cameras["cam2"].intrinsics
-    assert lens is not None
+    lens = session.lens("cam2")
     moved = [
         lens.project(session.poses["cam2"].camera_from_world(session.truth_at(label, "cam2", at)))
         for at in (time, time + late)

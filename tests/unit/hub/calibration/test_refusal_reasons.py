@@ -16,7 +16,7 @@ from hub.calibration.pipeline import _no_pair_reason, calibrate
 from hub.calibration.triangulation import triangulate
 from hub.sync.pair_solver import _PairSearch, solve_pair
 from hub.sync.settings import PairSettings
-from hub.trajectory.image_tracks import SmoothTrack, smooth_track
+from hub.trajectory.image_tracks import SmoothTrack
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.session.calibration import FixedCalibration
@@ -38,15 +38,8 @@ def refusal_texts(session: rigs.Session, solver: str = "joint") -> str:
     return "\n".join([*found.refused.values(), *(pair.status for pair in found.pairs)])
 
 
-def tracks(session: rigs.Session) -> tuple[dict[str, SmoothTrack], dict[str, SmoothTrack]]:
-    out = []
-    for name in ("cam0", "cam1"):
-        lens, (track,) = session.rig.cameras[name].intrinsics, session.observations().of_camera(name)
-        assert lens is not None
-        found = smooth_track(track.time, lens.unproject(track.pixels), lens.focal, float(track.time[0]))
-        assert found is not None
-        out.append({"marker": found})
-    return out[0], out[1]
+def tracks(session: rigs.Session) -> list[dict[str, SmoothTrack]]:
+    return [session.smoothed(name) for name in ("cam0", "cam1")]
 
 
 def pair_status(settings: PairSettings) -> str:

@@ -11,9 +11,8 @@ from scipy.linalg import eigh
 from hub.sync import lts_scan
 from hub.sync.lag_scan import GridTrack, PairMoments, grid_tracks, to_grid_coordinates
 from hub.sync.lts_scan import LtsScan, scan_lags_lts
-from hub.trajectory.image_tracks import smooth_track
 from protocols.geometry.types import Floats
-from tests.bench.pair_trials import FOCAL, MATRIX, Regime, Trial, make_trial, unrelated_trial
+from tests.bench.pair_trials import Regime, Trial, make_trial, unrelated_trial
 
 STEP, SIGMA_PX = 0.033, 0.5
 TWO_OBJECTS = Regime(span=15, second_object=0.2, late=2)
@@ -27,9 +26,7 @@ def random_grid(seed: int, count: int, labels: int = 2) -> GridTrack:
 
 def of(trial: Trial) -> tuple[PairMoments, float]:
     """The moments of a trial and its true lag."""
-    a, b = (smooth_track(view.time, (view.pixels - MATRIX[:2, 2]) / FOCAL, FOCAL) for view in trial.views)
-    assert a is not None
-    assert b is not None
+    a, b = trial.smoothed()
     middle = np.array([np.mean(trial.overlap)])
     offset = float((trial.shown(0, middle) - a.time_origin - trial.shown(1, middle) + b.time_origin)[0])
     return PairMoments(*(grid_tracks([track], STEP, SIGMA_PX) for track in (a, b))), offset
