@@ -199,8 +199,9 @@ def test_a_bad_size_is_reported(tmp_path: Path, size: str, word: str) -> None:
     assert_reported(tmp_path, f"camera,frame,time,u,v,size\na,0,0,1,2,3\na,1,1,1,2,{size}\n", 3, word)
 
 
-def test_a_row_cut_before_its_label_is_reported(tmp_path: Path) -> None:
-    assert_reported(tmp_path, "camera,frame,time,u,v,label\na,0,0,1,2,x\na,1,1,1,2\n", 3, "columns")
+@pytest.mark.parametrize(("further", "cells"), [("label", "x"), ("cov_uu,cov_vv", "1,1")])
+def test_a_row_cut_before_a_column_is_reported(tmp_path: Path, further: str, cells: str) -> None:
+    assert_reported(tmp_path, f"camera,frame,time,u,v,{further}\na,0,0,1,2,{cells}\na,1,1,1,2\n", 3, "columns")
 
 
 def test_two_rows_of_one_frame_are_reported(tmp_path: Path) -> None:
