@@ -30,6 +30,14 @@ class BoardCamera:
     fps: float
 
 
+def rig_cameras(cameras: dict[str, BoardCamera], lenses: bool) -> dict[str, RigCamera]:
+    """The cameras of a rig, with or without their lenses."""
+    return {
+        name: RigCamera(name, (one.lens.width, one.lens.height), one.fps, one.lens if lenses else None)
+        for name, one in cameras.items()
+    }
+
+
 @dataclass(frozen=True)
 class BoardWorld:
     """Cameras on an arc around a board that is moved and turned by hand. points: of the board [m], by label."""
@@ -47,11 +55,10 @@ class BoardWorld:
 
     def rig(self, lenses: bool = True, scale: float = 1.0) -> Rig:
         """The rig, with or without its lenses; the board's points times ``scale``."""
-        cameras = {
-            name: RigCamera(name, (one.lens.width, one.lens.height), one.fps, one.lens if lenses else None)
-            for name, one in self.cameras.items()
-        }
-        return Rig(cameras, bodies={"board": {label: scale * point for label, point in self.points.items()}})
+        return Rig(
+            rig_cameras(self.cameras, lenses),
+            bodies={"board": {label: scale * point for label, point in self.points.items()}},
+        )
 
     def views(
         self, seconds: float, seed: int, jitter: float = 0.0, readout: float = 0.0

@@ -126,15 +126,7 @@ class Session:
 
     def write(self, folder: pathlib.Path, metadata: str = "") -> pathlib.Path:
         """The session as a new folder. metadata: lines of that table."""
-        folder.mkdir()
-        text = f"[metadata]\n{metadata}\n" if metadata else ""
-        for name, camera in self.rig.cameras.items():
-            text += f'[{name}]\nname = "{name}"\nsize = {list(camera.size)}\nfps = {camera.fps}\n'
-            if (lens := camera.intrinsics) is not None:
-                text += f"matrix = {lens.matrix.tolist()}\ndistortions = {lens.distortions.tolist()}\n"
-        (folder / "rig.toml").write_text(text)
-        write_observations(folder / "observations.csv", self.observations())
-        return folder
+        return write_session(folder, self.rig, self.observations(), metadata)
 
     def csv(self) -> str:
         """The rows as observations.csv."""
@@ -175,6 +167,19 @@ class Session:
             truth = self.poses[name].rotation @ self.poses[first].rotation.T
             errors.append(so3.angle_between(found[name].rotation @ found[first].rotation.T, so3.nearest(truth)))
         return max(errors)
+
+
+def write_session(folder: pathlib.Path, rig: Rig, observations: Observations, metadata: str = "") -> pathlib.Path:
+    """Cameras and rows as a new folder. metadata: lines of that table."""
+    folder.mkdir()
+    text = f"[metadata]\n{metadata}\n" if metadata else ""
+    for name, camera in rig.cameras.items():
+        text += f'[{name}]\nname = "{name}"\nsize = {list(camera.size)}\nfps = {camera.fps}\n'
+        if (lens := camera.intrinsics) is not None:
+            text += f"matrix = {lens.matrix.tolist()}\ndistortions = {lens.distortions.tolist()}\n"
+    (folder / "rig.toml").write_text(text)
+    write_observations(folder / "observations.csv", observations)
+    return folder
 
 
 def random_path(rng: np.random.Generator, fastest: float = 0.7, extent: float = 1.0) -> Path:

@@ -9,8 +9,8 @@ import numpy as np
 from edge.scenes.common.placement import look_at_pose
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations, gather_tracks
-from protocols.session.rig import Rig, RigCamera
-from tests.support.board_session import BoardCamera, board_world
+from protocols.session.rig import Rig
+from tests.support.board_session import BoardCamera, board_world, rig_cameras
 
 JOINTS = (
     "nose", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
@@ -42,12 +42,7 @@ class PeopleWorld:
 
     def rig(self, lenses: bool = True) -> Rig:
         """The rig with independent clocks."""
-        return Rig(
-            {
-                name: RigCamera(name, (one.lens.width, one.lens.height), one.fps, one.lens if lenses else None)
-                for name, one in self.cameras.items()
-            }
-        )
+        return Rig(rig_cameras(self.cameras, lenses))
 
     def observations(
         self, seconds: float, *, noise: float = 2.0, seed: int = 0, renumbered_every: float = 5.0, missed: float = 0.05

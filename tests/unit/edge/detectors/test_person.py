@@ -27,7 +27,7 @@ from edge.detectors.people.segmentation import segment_people
 from edge.detectors.people.silhouettes import IsolatedPeople
 from edge.scenes import renderer_for
 from protocols.geometry.types import Image
-from tests.support.people_boxes import score_boxes
+from tests.support.people_boxes import overlap, score_boxes
 
 HEIGHT, WIDTH = 240, 320
 
@@ -223,7 +223,7 @@ def test_two_people_in_a_rendered_room_are_localised_five_seconds_after_the_star
         if index < 50:
             continue
         boxes = [box for box in scene.boxes(camera.name, moment) if np.isfinite(box).all() and box[3] > 40]
-        hits = sum(any(_overlap(one.box, box) >= 0.5 for box in boxes) for one in found if one.box is not None)
+        hits = sum(any(overlap(one.box, box) >= 0.5 for box in boxes) for one in found if one.box is not None)
         right, wrong, missed = right + hits, wrong + len(found) - hits, missed + max(len(boxes) - hits, 0)
     assert right / (right + wrong) > 0.9
     assert right / (right + missed) > 0.9
@@ -249,16 +249,6 @@ def test_clothes_of_the_floors_colour_are_distinguished_from_shadows(shown: floa
     shadow, cloth = (slice(70, 170), slice(50, 110)), (slice(70, 170), slice(210, 270))
     assert (masks.shadow[shadow] > 0).mean() > 0.9
     assert (masks.foreground[cloth] > 0).mean() > 0.9
-
-
-def _overlap(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
-    x, y, w, h = np.asarray(a)
-    x2, y2, w2, h2 = np.asarray(b)
-    across = min(x + w, x2 + w2) - max(x, x2)
-    down = min(y + h, y2 + h2) - max(y, y2)
-    if across <= 0 or down <= 0:
-        return 0.0
-    return float(across * down / (w * h + w2 * h2 - across * down))
 
 
 def draw_car(picture: Image, u: float, v: float) -> None:
