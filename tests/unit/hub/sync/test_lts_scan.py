@@ -35,7 +35,7 @@ def of(trial: Trial) -> tuple[PairMoments, float]:
 @cache
 def scanned(seed: int) -> tuple[PairMoments, float, LtsScan]:
     moments, offset = of(make_trial(TWO_OBJECTS, seed))
-    return moments, offset, scan_lags_lts(moments, SIGMA_PX, seed=0)
+    return moments, offset, scan_lags_lts(moments, SIGMA_PX)
 
 
 def test_bin_moments_are_direct_sums() -> None:
@@ -119,7 +119,7 @@ def test_the_estimated_geometry_is_that_of_the_marker(seed: int) -> None:
 
 def test_unrelated_tracks_have_less_inlier_time() -> None:
     moments, _ = of(unrelated_trial(make_trial(TWO_OBJECTS, 1), TWO_OBJECTS, 1))
-    scan = scan_lags_lts(moments, SIGMA_PX, seed=0)
+    scan = scan_lags_lts(moments, SIGMA_PX)
     inlier_seconds = scan.inlier_seconds[scan.inlier_seconds > 0]
     _, _, true = scanned(1)
     assert inlier_seconds.max() < 0.75 * true.inlier_seconds.max()
@@ -138,13 +138,13 @@ def test_inlier_time_does_not_exceed_the_overlap() -> None:
 
 def test_the_scan_is_deterministic_in_its_seed() -> None:
     moments, _, scan = scanned(0)
-    again = scan_lags_lts(moments, SIGMA_PX, seed=0)
+    again = scan_lags_lts(moments, SIGMA_PX)
     np.testing.assert_array_equal(scan.inlier_seconds, again.inlier_seconds)
     np.testing.assert_array_equal(scan.matrix, again.matrix)
 
 
 def test_short_tracks_have_no_inlier_time() -> None:
     moments = PairMoments(random_grid(1, 50), random_grid(2, 50))
-    scan = scan_lags_lts(moments, SIGMA_PX, seed=0)
+    scan = scan_lags_lts(moments, SIGMA_PX)
     assert (scan.inlier_seconds == 0).all()
     assert np.isinf(scan.misfit).all()
