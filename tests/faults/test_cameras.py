@@ -22,6 +22,7 @@ from protocols.topics import OBSERVATION, STATUS
 from tests.faults.matrix import measured
 from tests.faults.processes import wait_until
 from tests.support.mjpeg_camera import MjpegCamera
+from tests.support.threads import running
 
 PERIOD_S = 1 / 30
 
@@ -81,10 +82,8 @@ class Bright:
 )
 def test_a_camera_without_usable_frames_is_reported_and_publishes_nothing_stale(kind: str, words: str) -> None:
     hub = MemoryHub()
-    device, stop = Flawed(kind), threading.Event()
+    device = Flawed(kind)
     observations, statuses = MemoryBus(hub).subscribe(OBSERVATION), MemoryBus(hub).subscribe(STATUS)
-    agent = threading.Thread(target=_run, args=(device, MemoryBus(hub), stop), daemon=True)
-    agent.start()
     received: list[pb.AgentStatus] = []
 
     def has_received(condition: Callable[[pb.AgentStatus], bool]) -> Callable[[], bool]:
@@ -94,25 +93,24 @@ def test_a_camera_without_usable_frames_is_reported_and_publishes_nothing_stale(
 
         return check
 
-    wait_until(has_received(lambda status: status.state == "running"))
-    time.sleep(0.5)
-    assert len(observations.drain()) > 5
-    device.flaw.set()
-    began = time.monotonic()
-    seconds = wait_until(has_received(lambda status: status.state == "degraded" and words in status.message))
-    time.sleep(1.0)
-    stale = [
-        item.message
-        for item in observations.drain()
-        if item.message.device_time_ns * 1e-9 > began + 2 * PERIOD_S and len(item.message.detections)  # type: ignore[attr-defined]
-    ]
-    if kind not in ("stalled", "unplugged"):
-        received.clear()
-        device.flaw.clear()
+    with running(CameraAgent(device, Bright(), MemoryBus(hub), "cam0").run):
         wait_until(has_received(lambda status: status.state == "running"))
-        assert len(observations.drain()) >= 0
-    stop.set()
-    agent.join(10.0)
+        time.sleep(0.5)
+        assert len(observations.drain()) > 5
+        device.flaw.set()
+        began = time.monotonic()
+        seconds = wait_until(has_received(lambda status: status.state == "degraded" and words in status.message))
+        time.sleep(1.0)
+        stale = [
+            item.message
+            for item in observations.drain()
+            if item.message.device_time_ns * 1e-9 > began + 2 * PERIOD_S and len(item.message.detections)  # type: ignore[attr-defined]
+        ]
+        if kind not in ("stalled", "unplugged"):
+            received.clear()
+            device.flaw.clear()
+            wait_until(has_received(lambda status: status.state == "running"))
+            assert len(observations.drain()) >= 0
     measured(
         f"camera {kind}",
         "reported ≤ 2 s, nothing stale published",
@@ -127,11 +125,7 @@ def test_a_network_camera_that_was_unplugged_comes_back_in_the_same_run_of_its_a
     server = MjpegCamera()
     hub = MemoryHub()
     observations, statuses = MemoryBus(hub).subscribe(OBSERVATION), MemoryBus(hub).subscribe(STATUS)
-    camera, stop = OpenCvCamera(server.url), threading.Event()
-    agent = threading.Thread(
-        target=CameraAgent(camera, Bright(), MemoryBus(hub), "cam0").run, args=(stop,), daemon=True
-    )
-    agent.start()
+    camera = OpenCvCamera(server.url)
     seen: list[pb.Observation] = []
     received: list[pb.AgentStatus] = []
 
@@ -142,7 +136,7 @@ def test_a_network_camera_that_was_unplugged_comes_back_in_the_same_run_of_its_a
     def until(condition: Callable[[], bool]) -> float:
         return wait_until(lambda: (check(), condition())[1])  # type: ignore[func-returns-value]
 
-    try:
+    with running(CameraAgent(camera, Bright(), MemoryBus(hub), "cam0").run):
         until(lambda: len(seen) > 25)
         server.unplug()
         flagged = until(lambda: bool(received) and received[-1].state == "degraded")
@@ -153,10 +147,7 @@ def test_a_network_camera_that_was_unplugged_comes_back_in_the_same_run_of_its_a
         server = MjpegCamera(server.port)
         back = until(lambda: len(seen) > count + 10)
         until(lambda: received[-1].state == "running" and received[-1].counters["reconnections"] == 1)
-    finally:
-        stop.set()
-        agent.join(10.0)
-        server.unplug()
+    server.unplug()
     measured(
         "camera unplugged and back",
         "reported ≤ 2 s, back ≤ 5 s, same run",
@@ -186,7 +177,3 @@ def test_a_camera_that_is_gone_for_good_ends_its_agent_with_the_reason() -> None
     device.gone = True
     with pytest.raises(InputError, match="camera cam0 is gone; plug it in"):
         CameraAgent(device, Bright(), MemoryBus(MemoryHub()), "cam0").run(threading.Event())
-
-
-def _run(device: Flawed, bus: MemoryBus, stop: threading.Event) -> None:
-    CameraAgent(device, Bright(), bus, "cam0").run(stop)
