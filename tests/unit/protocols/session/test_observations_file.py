@@ -9,8 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from protocols.core.errors import EXIT_INPUT, InputError
+from protocols.core.errors import InputError
 from protocols.session.observations import DEFAULT_LABEL, Observations, read_observations
+from tests.support import command_line
 
 HEAD = "camera,frame,time,u,v\n"
 ROWS = "a,0,10.0,1.5,2.5\na,1,10.1,3,4\nb,0,1.7e9,5,6\n"
@@ -23,17 +24,7 @@ def read(tmp_path: Path, text: str | bytes) -> Observations:
 
 
 def assert_reported(tmp_path: Path, text: str | bytes, line: int | None, *words: str) -> None:
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, text)
-    error, message = caught.value, str(caught.value)
-    assert error.exit_status == EXIT_INPUT
-    file = tmp_path / "observations.csv"
-    assert message.startswith(f"{file}:" if line is None else f"{file}:{line}: "), message
-    assert error.remedy
-    assert error.remedy in message
-    assert "\n" not in message
-    for word in words:
-        assert word in message, message
+    command_line.assert_reported(lambda: read(tmp_path, text), tmp_path / "observations.csv", line, *words)
 
 
 def same(one: Observations, other: Observations) -> bool:
