@@ -25,7 +25,6 @@ from protocols.session.calibration import (
     FixedCalibration,
     TrajectoryTable,
     calibration_text,
-    csv_cell,
     read_calibration,
     trajectory_text,
 )
@@ -95,7 +94,7 @@ class CalibrationResult:
         write_together(
             {
                 folder / CALIBRATION: calibration_text(found, rig),
-                folder / TRAJECTORY: trajectory_text(found),
+                folder / TRAJECTORY: trajectory_text(found.trajectories, labelled=len(found.trajectories) > 1),
                 folder / RESULT: result_text(document),
                 folder / REPORT: build_report(found, rig, self.session.observations, command),
             }
@@ -149,12 +148,7 @@ class TriangulationResult:
 
     def save(self, file: str | Path) -> None:
         """Write time,x,y,z,std,label as CSV, floats with 17 significant digits. Raises InputError."""
-        rows = [
-            f"{t:.17g},{x:.17g},{y:.17g},{z:.17g},{std:.17g},{csv_cell(table.label)}"
-            for table in self.tables
-            for t, (x, y, z), std in zip(table.time, table.position, table.std, strict=True)
-        ]
-        write_atomically(Path(file), "\n".join(["time,x,y,z,std,label", *rows]) + "\n")
+        write_atomically(Path(file), trajectory_text(self.tables, labelled=True))
 
     def to_dataframe(self) -> pandas.DataFrame:
         """One row per sample: time [s, reference clock], x, y, z, std [rig units], label. Needs pandas."""

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.offline.csv_table import read_csv_table
 from deploy.offline.track import TrackedFrame
 from edge.uav.base import TrackState
 from protocols.core.errors import InputError
 from protocols.geometry.types import Bools, Floats
+from protocols.session.csv_table import read_csv_table
 
 NEAR_PX = 20.0  # of a track that is on its target
 _MIN_NEAR_SHARE, _OTHER_NEAR_SHARE = 0.5, 0.8  # of visible frames near a truth as it is, and in another convention

@@ -19,9 +19,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from deploy.offline.csv_table import read_csv_header, read_csv_table
 from protocols.core.errors import InputError
 from protocols.geometry.types import Bools, Floats, Ints
+from protocols.session.csv_table import read_csv_header, read_csv_table
 
 MATCH_M = 0.5
 """Largest distance on the ground [m] of a track from the person that it follows."""
@@ -78,13 +78,14 @@ def read_ground_truth(file: Path, frame_times: Mapping[int, float] | None) -> Gr
             what = f"frame {frame[0]} is none of the followed frames ({min(frame_times)} to {max(frame_times)})"
             raise InputError(what, file=file, line=table.line[0], remedy="give time in place of frame")
         time = np.array([frame_times.get(number, math.nan) for number in frame])
-    names = {name: index for index, name in enumerate(dict.fromkeys(table.columns["person"]))}
-    person = np.array([names[name] for name in table.columns["person"]], dtype=np.int64)
+    people = table.text("person")
+    names = {name: index for index, name in enumerate(dict.fromkeys(people))}
+    person = np.array([names[name] for name in people], dtype=np.int64)
     place = np.column_stack([table.numbers(name, _MAX_VALUE) for name in ("x", "y")])
     pairs: dict[tuple[float, int], int] = {}
     for row, key in enumerate(zip(time.tolist(), person.tolist(), strict=True)):
         if pairs.setdefault(key, row) != row:
-            what = f"person {table.columns['person'][row]!r} is at two places at one time"
+            what = f"person {people[row]!r} is at two places at one time"
             raise InputError(what, file=file, line=table.line[row], remedy="keep one row a person a time")
     truth = GroundTruth(time, person, place)
     return truth.select(np.isfinite(time))

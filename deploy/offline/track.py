@@ -12,7 +12,6 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from deploy.offline.csv_table import read_csv_table
 from edge.devices.base import Frame
 from edge.devices.playback.video_file import image_files
 from edge.uav.base import Basis, Box, Estimate, Telemetry, Tracker, TrackState
@@ -20,6 +19,7 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry import so3
 from protocols.geometry.types import Floats, Image
+from protocols.session.csv_table import read_csv_table
 from protocols.session.rig import RigCamera, read_rig
 
 TRACK, HYPOTHESES, OVERLAY = "track.csv", "hypotheses.csv", "overlay.mp4"

@@ -40,13 +40,10 @@ def get_marker_scene(name: str, seed: int, cameras: int | None = None, mixed_fps
     return marker_room(seed, 3 if cameras is None else cameras, mixed_fps)
 
 
-def get_people_scene(
-    seed: int, cameras: int | None = None, people: int | None = None, *, mixed_fps: bool = False
-) -> PeopleScene:
+def get_people_scene(seed: int, cameras: int | None = None, people: int | None = None) -> PeopleScene:
     """The scene ``people``: people walking in a room; the same arguments always give the same scene.
 
-    cameras: 2 or more, None = 5. people: 1 to 12, None = 5. mixed_fps: 10, 12.5, 9.99 and 15 fps instead of 10. Raises
-    InputError.
+    cameras: 2 or more, None = 5. people: 1 to 12, None = 5. Raises InputError.
     """
     from edge.scenes.people.scene import MAX_PEOPLE, people_room
 
@@ -55,7 +52,7 @@ def get_people_scene(
         raise InputError(f"a scene needs at least 2 cameras, not {cameras}", remedy="give --cameras 2 or more")
     if not 1 <= people <= MAX_PEOPLE:
         raise InputError(f"{people} people do not fit into the room", remedy=f"give --people 1 to {MAX_PEOPLE}")
-    return people_room(seed, cameras, people, mixed_fps)
+    return people_room(seed, cameras, people)
 
 
 def get_scene(name: str, seed: int, cameras: int | None = None, people: int | None = None) -> SimulatedScene:

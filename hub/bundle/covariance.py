@@ -96,7 +96,7 @@ def covariance(
     (q, 18 n) directions in which nothing is uncertain, because control points without std fix them. longest: see
     `gauge_constraints`.
     """
-    parts, blocks = eliminate_paths(problem, state, prior)
+    parts, blocks = _eliminate_paths(problem, state, prior)
     columns = problem.free_columns
     information = parts.reduced
     constraints = np.zeros((0, len(columns)))
@@ -113,7 +113,7 @@ def covariance(
     return Covariance(columns, len(state.cameras), free, parts.a_inv_b, blocks)
 
 
-def eliminate_paths(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> tuple[Elimination, Floats]:
+def _eliminate_paths(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> tuple[Elimination, Floats]:
     """The reduced camera system at a state, and blocks (k, 24, 24) of A⁻¹ about the diagonal.
 
     The prior's cost is invariant under affine maps of a path, its linearisation in a fixed metric is not: it held the

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hub.bundle.covariance import Covariance, eliminate_paths
+from hub.bundle.covariance import Covariance
 from hub.bundle.model_comparison import LENS, ScoreTest, mirrored_axis, refuted_lenses
+from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
 from protocols.core.errors import Refused
@@ -67,9 +68,14 @@ def sensitivities(
     held = [i for i in range(len(names)) if problem.lens_prior(i) is None and not free.lens]
     if held:
         freed = replace(problem, free_parameters=replace(free, lens=True))
-        normal, columns = eliminate_paths(freed, state, prior)[0].reduced, freed.free_columns
-        focal = normal.columns(np.searchsorted(columns, np.array(held) * CAMERA_PARAMETERS + FOCAL))
-        changes = -found.spread(found.free @ focal[np.searchsorted(columns, base)])
+        system, columns = build_system(freed, state, prior, robust=False)[0], freed.free_columns
+        focal = np.searchsorted(columns, np.array(held) * CAMERA_PARAMETERS + FOCAL)
+        normal = system.corner.columns(focal)[np.searchsorted(columns, base)]
+        # The paths were eliminated for the covariance: all but the focal lengths' columns of the border is in A⁻¹ B.
+        for (_, seeing, border), (_, own, solved) in zip(system.border.parts, found.a_inv_b.parts, strict=True):
+            here = np.flatnonzero(np.isin(seeing, focal))
+            normal[np.ix_(own, np.searchsorted(focal, seeing[here]))] -= solved.T @ border[:, here]
+        changes = -found.spread(found.free @ normal)
         lenses = dict(zip(held, changes.T, strict=True))
     out: list[tuple[Sensitivity, ...]] = []
     for i, name in enumerate(names):

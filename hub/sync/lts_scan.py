@@ -40,8 +40,8 @@ class LtsScan:
     matrix: Floats
 
 
-def scan_lags_lts(moments: PairMoments, sigma_px: float, seed: int) -> LtsScan:
-    """LTS scan of all lags. sigma_px: image noise std of the grids [px]. seed: of the random initial geometries."""
+def scan_lags_lts(moments: PairMoments, sigma_px: float) -> LtsScan:
+    """LTS scan of all lags. sigma_px: image noise std of the grids [px]."""
     a, b = moments.a, moments.b
     count = len(moments.lags)
     inlier_seconds, misfit, matrix = np.zeros(count), np.full(count, np.inf), np.zeros((count, 3, 3))
@@ -49,7 +49,7 @@ def scan_lags_lts(moments: PairMoments, sigma_px: float, seed: int) -> LtsScan:
     bins = a.weight.shape[1] // width
     if bins < _MIN_BINS:
         return LtsScan(inlier_seconds, misfit, matrix)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)  # of the initial geometries
     limit = (_INLIER_PX / sigma_px) ** 2
     usual = _median_weight(a) * _median_weight(b) * width
     chunk = max(1, _MAX_CELLS // (bins * 36))

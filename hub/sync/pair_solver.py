@@ -313,7 +313,7 @@ class _PairSearch:
         s, step = self.s, max(self.step, _LTS_STEP)
         grid_a = most_active_window(grid_tracks(self.a, step, s.sigma_px), _MAX_LTS_SECONDS)
         moments = PairMoments(grid_a, grid_tracks(self.b, step, s.sigma_px))
-        scan = scan_lags_lts(moments, s.sigma_px, seed=0)
+        scan = scan_lags_lts(moments, s.sigma_px)
         tried = scan.inlier_seconds > 0
         if not tried.any():
             return PairSolution(*names, "the tracks are discontinuous, and no lag leaves enough common motion")

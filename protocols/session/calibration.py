@@ -201,12 +201,11 @@ def calibration_text(calibration: Calibration, rig: Rig) -> str:
     return tomli_w.dumps(_plain(calibration_tables(calibration, rig)))
 
 
-def trajectory_text(calibration: Calibration) -> str:
-    """trajectory.csv: time,x,y,z,std[,label] on the reference clock; label where there are several."""
-    several = len(calibration.trajectories) > 1
-    lines = ["time,x,y,z,std,label" if several else "time,x,y,z,std"]
-    for table in calibration.trajectories:
-        tail = f",{csv_cell(table.label)}" if several else ""
+def trajectory_text(tables: Sequence[TrajectoryTable], labelled: bool) -> str:
+    """trajectory.csv: time,x,y,z,std[,label] on the reference clock."""
+    lines = ["time,x,y,z,std,label" if labelled else "time,x,y,z,std"]
+    for table in tables:
+        tail = f",{csv_cell(table.label)}" if labelled else ""
         rows = zip(table.time.tolist(), table.position.tolist(), table.std.tolist(), strict=True)
         for t, (x, y, z), std in rows:  # Python's own floats are written three times as fast as numpy's
             lines.append(f"{t:.17g},{x:.17g},{y:.17g},{z:.17g},{std:.17g}{tail}")

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from protocols.core.errors import InputError
 from protocols.geometry.types import Floats, Ints
 from protocols.session.observations import ObservationRows, read_rows
 
@@ -62,22 +61,22 @@ def read_detections(file: Path, sizes: Mapping[str, tuple[int, int]]) -> Detecti
     """
     rows = read_rows(file, sizes, COLUMNS)
     score = rows.numbers("score", 1.0)
-    rows.refuse(score < 0.0, lambda row: f"score {score[row]:g} is negative", "give 0 to 1")
+    rows.table.refuse(score < 0.0, lambda row: f"score {score[row]:g} is negative", "give 0 to 1")
     covariance = _together(rows, ("cov_uu", "cov_uv", "cov_vv"), _MAX_VARIANCE)
     uu, uv, vv = covariance.T
     # The tolerance lets a covariance of rank one pass after rounding, as on the bus.
     invalid = (uu < 0.0) | (vv < 0.0) | (uv * uv > uu * vv * (1.0 + 1e-9) + 1e-12)
-    rows.refuse(invalid, lambda row: "cov_uu, cov_uv, cov_vv are no covariance")
+    rows.table.refuse(invalid, lambda row: "cov_uu, cov_uv, cov_vv are no covariance")
     head, foot = _together(rows, ("head_u", "head_v")), _together(rows, ("foot_u", "foot_v"))
     across, down = (foot - head).T
     # In a camera on its side, head and foot are beside each other.
     turned = (down <= 0.0) & (np.abs(across) <= np.abs(down))
-    rows.refuse(turned, lambda row: "the head is not above the foot", "swap them, or turn the images upright")
+    rows.table.refuse(turned, lambda row: "the head is not above the foot", "swap them, or turn the images upright")
     box = _together(rows, ("box_x", "box_y", "box_w", "box_h"))
-    rows.refuse((box[:, 2:] <= 0.0).any(axis=1), lambda row: f"a box of {box[row, 2]:g} x {box[row, 3]:g} px")
+    rows.table.refuse((box[:, 2:] <= 0.0).any(axis=1), lambda row: f"a box of {box[row, 2]:g} x {box[row, 3]:g} px")
     limit = np.array([sizes[name] for name in rows.camera], dtype=np.float64).reshape(-1, 2)
     outside = ((box[:, :2] >= limit) | (box[:, :2] + box[:, 2:] <= 0.0)).any(axis=1)
-    rows.refuse(outside, lambda row: f"the box lies outside the {limit[row, 0]:g}x{limit[row, 1]:g} image")
+    rows.table.refuse(outside, lambda row: f"the box lies outside the {limit[row, 0]:g}x{limit[row, 1]:g} image")
     return DetectionRows(
         rows.camera,
         rows.label,
@@ -91,7 +90,7 @@ def read_detections(file: Path, sizes: Mapping[str, tuple[int, int]]) -> Detecti
         head,
         foot,
         box,
-        rows.line,
+        rows.table.line,
     )
 
 
@@ -104,16 +103,15 @@ def _together(rows: ObservationRows, names: tuple[str, ...], limit: float = 1e6)
     def what(row: int) -> str:
         return f"{', '.join(name for name, there in zip(names, given[row], strict=True) if not there)} is empty"
 
-    rows.refuse(half, what, f"give all of {', '.join(names)}, or none")
+    rows.table.refuse(half, what, f"give all of {', '.join(names)}, or none")
     return values
 
 
 def _kinds(rows: ObservationRows) -> list[str]:
-    if "kind" not in rows.column:
-        return [""] * len(rows.cells)
-    kinds = [cells[rows.column["kind"]].strip() for cells in rows.cells]
-    for kind, line in zip(kinds, rows.line, strict=True):
-        if kind not in KINDS:
-            remedy = f"use one of {', '.join(KINDS[1:])}, or leave it empty"
-            raise InputError(f"kind {kind[:40]!r} is not known", file=rows.file, line=line, remedy=remedy)
+    if "kind" not in rows.table.columns:
+        return [""] * len(rows.table)
+    kinds = rows.table.text("kind")
+    unknown = np.array([kind not in KINDS for kind in kinds])
+    remedy = f"use one of {', '.join(KINDS[1:])}, or leave it empty"
+    rows.table.refuse(unknown, lambda row: f"kind {kinds[row][:40]!r} is not known", remedy)
     return kinds

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from protocols.core.errors import InputError
-from protocols.core.files import read_text
 from protocols.core.ranges import MAX_COUNT, MAX_PIXEL, MAX_TIME_S
 from protocols.geometry.types import Bools, Floats, Ints
+from protocols.session.csv_table import CsvTable, read_csv_table
 
 REQUIRED = ("camera", "frame", "time", "u", "v")
 DEFAULT_LABEL = "marker"
@@ -81,39 +79,28 @@ class Observations:
 class ObservationRows:
     """The columns of an observations.csv in the file's order, n rows.
 
-    camera, label: n names. frame: (n,). time: (n,) [s]. pixels: (n, 2). size: (n,) [px], NaN where not measured. line:
-    (n,) line numbers. cells: n rows of text. column: index of each column by its name.
+    table: all that was asked for. camera, label: n names. frame: (n,). time: (n,) [s]. pixels: (n, 2). size: (n,) [px],
+    NaN where not measured.
     """
 
-    file: Path
+    table: CsvTable
     camera: list[str]
     label: list[str]
     frame: Ints
     time: Floats
     pixels: Floats
     size: Floats
-    line: list[int]
-    cells: list[list[str]]
-    column: dict[str, int]
 
     def numbers(self, name: str, limit: float = MAX_PIXEL) -> Floats:
         """An optional column (n,); NaN where the cell is empty. Raises InputError beyond ±limit."""
-        if name not in self.column:
-            return np.full(len(self.cells), np.nan)
-        values = _column(self.cells, self.line, self.column[name], name, self.file, empty=np.nan)
-        empty = np.array([not cells[self.column[name]].strip() for cells in self.cells])
-        self.refuse(np.isnan(values) & ~empty, lambda row: f"{name} is nan", "leave a cell that was not seen empty")
-        self.refuse(np.abs(values) > limit, lambda row: f"{name} {values[row]:g} is beyond ±{limit:g}")
+        if name not in self.table.columns:
+            return np.full(len(self.table), np.nan)
+        values, refuse = self.table.numbers_or_gaps(name), self.table.refuse
+        empty = np.array([not cell.strip() for cell in self.table.columns[name]])
+        wrong = (np.isnan(values) & ~empty) | np.isinf(values)
+        refuse(wrong, lambda row: f"{name} is {values[row]:g}", "leave a cell that was not seen empty")
+        refuse(np.abs(values) > limit, lambda row: f"{name} {values[row]:g} is beyond ±{limit:g}")
         return values
-
-    def refuse(
-        self, bad: Bools | np.bool_, what: Callable[[int], str], remedy: str = "correct or remove the row"
-    ) -> None:
-        """Raise InputError with the line of the first row (n,) that is ``bad``."""
-        which = np.flatnonzero(bad)
-        if len(which):
-            row = int(which[0])
-            raise InputError(what(row), file=self.file, line=self.line[row], remedy=remedy)
 
 
 def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
@@ -122,7 +109,7 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
     cameras: the names that the rig knows. Raises InputError: file, line, what, remedy.
     """
     known = list(cameras)
-    rows = read_rows(file, known)
+    rows = read_rows(file, known, ("cov_uu", "cov_vv"))
     return gather_tracks(
         rows.camera,
         rows.label,
@@ -133,16 +120,16 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
         stds=_stds(rows),
         order=known,
         file=file,
-        lines=rows.line,
+        lines=rows.table.line,
     )
 
 
 def _stds(rows: ObservationRows) -> Floats | None:
     """Stds (n,) [px] of one coordinate from the columns cov_uu and cov_vv; None without them."""
-    if not {"cov_uu", "cov_vv"} <= rows.column.keys():
+    if not {"cov_uu", "cov_vv"} <= rows.table.columns.keys():
         return None
     variance = 0.5 * (rows.numbers("cov_uu", MAX_PIXEL**2) + rows.numbers("cov_vv", MAX_PIXEL**2))
-    rows.refuse(variance < 0.0, lambda row: "cov_uu, cov_vv are no covariance")
+    rows.table.refuse(variance < 0.0, lambda row: "cov_uu, cov_vv are no covariance")
     return np.sqrt(variance)
 
 
@@ -151,67 +138,36 @@ def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) 
 
     optional: names of further columns, which every row must then have. Raises InputError: file, line, what, remedy.
     """
-    reader = csv.reader(io.StringIO(read_text(file, "observations file")), strict=True)
-    try:
-        header = [cell.strip() for cell in next(reader, [])]
-    except csv.Error as error:
-        raise InputError(f"not CSV: {error}", file=file, line=1, remedy="save it as CSV") from None
-    columns = {name: index for index, name in reversed(list(enumerate(header)))}
-    used = (*REQUIRED, "size", "label", *optional)
-    twice = [name for name in used if header.count(name) > 1]
-    if twice:
-        raise InputError(f"column {twice[0]} is named twice", file=file, line=1, remedy="keep one")
-    check_columns(header, REQUIRED, file, "[,size][,label]")
-    rows: list[list[str]] = []
-    lines: list[int] = []
-    try:
-        for row in reader:
-            if "".join(row).strip():
-                rows.append(row)
-                lines.append(reader.line_num)
-    except csv.Error as error:
-        raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
-    if not rows:
-        raise InputError("no rows", file=file, line=1, remedy="record some observations first")
-    last = max(columns[name] for name in columns if name in used)
-    for row, line in zip(rows, lines, strict=True):
-        check_width(row, line, len(header), last, file)
-    numbers = {name: _column(rows, lines, columns[name], name, file) for name in ("time", "u", "v")}
-    far = np.flatnonzero(np.abs(numbers["time"]) > MAX_TIME_S)
-    if len(far):
-        what = f"time {numbers['time'][far[0]]:g} is no time in seconds"
-        raise InputError(what, file=file, line=lines[far[0]], remedy="give seconds; Unix time is about 1.8e9")
-    for name in ("u", "v"):
-        far = np.flatnonzero(np.abs(numbers[name]) > MAX_PIXEL)
-        if len(far):
-            what = f"{name} {numbers[name][far[0]]:g} is no pixel"
-            raise InputError(what, file=file, line=lines[far[0]], remedy="correct or remove the row")
-    frame = _frames(rows, lines, columns["frame"], file)
-    size = np.full(len(rows), np.nan)
-    if "size" in columns:
-        size = _column(rows, lines, columns["size"], "size", file, empty=np.nan)
-        bad = np.flatnonzero(size < 0)
-        if len(bad):
-            raise InputError(f"size {size[bad[0]]:g} is negative", file=file, line=lines[bad[0]], remedy="remove it")
-        size = np.where(size > 0, size, np.nan)
-    names = [row[columns["camera"]].strip() for row in rows]
-    labels = [row[columns["label"]].strip() or DEFAULT_LABEL for row in rows] if "label" in columns else None
-    for label, line in zip(labels or (), lines, strict=False):
-        if not label.isprintable():
-            what = f"label {label[:80]!a} has a character that cannot be printed"
-            raise InputError(what, file=file, line=line, remedy="rename the point")
-    _check_cameras(names, lines, list(cameras), file)
+    table = read_csv_table(file, "observations", REQUIRED, ("size", "label", *optional), "[,size][,label]")
+    time, u, v = (table.finite(name) for name in ("time", "u", "v"))
+    remedy = "give seconds; Unix time is about 1.8e9"
+    table.refuse(np.abs(time) > MAX_TIME_S, lambda row: f"time {time[row]:g} is no time in seconds", remedy)
+    far = np.maximum(np.abs(u), np.abs(v)) > MAX_PIXEL
+    table.refuse(far, lambda row: f"u, v {u[row]:g}, {v[row]:g} is no pixel")
+    frame, frames = table.finite("frame"), table.text("frame")
+    bad = (frame != np.round(frame)) | (np.abs(frame) > MAX_COUNT)
+    table.refuse(bad, lambda row: f"frame {frames[row]} is not a whole number", "correct it")
+    size = table.numbers_or_gaps("size") if "size" in table.columns else np.full(len(table), np.nan)
+    table.refuse((size < 0) | np.isinf(size), lambda row: f"size {size[row]:g} is negative or infinite", "remove it")
+    names = table.text("camera")
+    labels = [label or DEFAULT_LABEL for label in table.text("label")] if "label" in table.columns else None
+    unprintable = np.array([not label.isprintable() for label in labels or ()], dtype=np.bool_)
+    what = "has a character that cannot be printed"
+    table.refuse(unprintable, lambda row: f"label {(labels or names)[row][:80]!a} {what}", "rename the point")
+    known = list(cameras)
+    for name in dict.fromkeys(names):
+        if name not in known:
+            what = f"camera {name!r} is not in the rig ({', '.join(known)})"
+            remedy = f"add [{name}] to rig.toml or correct the name"
+            raise InputError(what, file=file, line=table.line[names.index(name)], remedy=remedy)
     return ObservationRows(
-        file,
+        table,
         names,
-        labels or [DEFAULT_LABEL] * len(rows),
-        frame,
-        numbers["time"],
-        np.column_stack([numbers["u"], numbers["v"]]),
-        size,
-        lines,
-        rows,
-        columns,
+        labels or [DEFAULT_LABEL] * len(table),
+        frame.astype(np.int64),
+        time,
+        np.column_stack([u, v]),
+        np.where(size > 0, size, np.nan),
     )
 
 
@@ -320,69 +276,3 @@ def _check_repeats(
         )
     repeats = f"{where}: frame numbers repeat ({repeated} of {len(frame)}); only its times are used"
     warnings.append(f"{repeats}; if it was started twice, name its second run as another camera")
-
-
-def check_columns(header: Sequence[str], required: Sequence[str], file: Path, optional: str = "") -> None:
-    """Raise InputError if a required column is missing in the first line of a CSV file."""
-    missing = [name for name in required if name not in header]
-    if missing:
-        remedy = f"the first line must name {','.join(required)}{optional}"
-        if len(header) == 1 and (found := [sign for sign in (";", "\t", "|") if sign in header[0]]):
-            remedy = f"its columns are separated by {found[0]!r}: separate them by commas, and decimals by points"
-        raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
-
-
-def check_width(row: Sequence[str], line: int, width: int, last: int, file: Path) -> None:
-    """Raise InputError for a row without its column ``last``, or with cells beyond the ``width`` of the first line."""
-    if len(row) <= last or (len(row) > width and any(cell.strip() for cell in row[width:])):
-        remedy = "complete the row" if len(row) <= last else "name every column; quote text with commas; decimal points"
-        raise InputError(f"{len(row)} columns where the first line has {width}", file=file, line=line, remedy=remedy)
-
-
-def _column(
-    rows: list[list[str]], lines: list[int], index: int, name: str, file: Path, empty: float | None = None
-) -> Floats:
-    cells = [row[index] for row in rows]
-    if empty is not None:
-        cells = [cell if cell.strip() else str(empty) for cell in cells]
-    try:
-        values = np.array(cells, dtype=np.float64)
-    except ValueError:
-        for cell, line in zip(cells, lines, strict=True):
-            try:
-                float(cell)
-            except ValueError:
-                what = f"{name} {cell!r} is not a number"
-                raise InputError(what, file=file, line=line, remedy="correct or remove the row") from None
-        raise
-    finite = np.isfinite(values) if empty is None else np.isfinite(values) | np.isnan(values)
-    bad = np.flatnonzero(~finite)
-    if len(bad):
-        what = f"{name} is {values[bad[0]]}"
-        raise InputError(what, file=file, line=lines[bad[0]], remedy="remove the row: a point not seen has none")
-    return values
-
-
-def _frames(rows: list[list[str]], lines: list[int], index: int, file: Path) -> Ints:
-    values = _column(rows, lines, index, "frame", file)
-    bad = np.flatnonzero((values != np.round(values)) | (np.abs(values) > MAX_COUNT))
-    if len(bad):
-        raise InputError(
-            f"frame {rows[bad[0]][index].strip()} is not a whole number",
-            file=file,
-            line=lines[bad[0]],
-            remedy="correct it",
-        )
-    return values.astype(np.int64)
-
-
-def _check_cameras(names: list[str], lines: list[int], known: list[str], file: Path) -> None:
-    allowed = set(known)
-    for name, line in zip(names, lines, strict=True):
-        if name not in allowed:
-            raise InputError(
-                f"camera {name!r} is not in the rig ({', '.join(known)})",
-                file=file,
-                line=line,
-                remedy=f"add [{name}] to rig.toml or correct the name",
-            )

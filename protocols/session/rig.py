@@ -238,33 +238,32 @@ def _read_bodies(meta: _Table) -> dict[str, dict[str, Floats]]:
 
 def _read_scale_bars(meta: _Table) -> tuple[tuple[str, str, float], ...]:
     remedy = 'give wand = [["tip", "grip", 0.5]]: two labels and the length between them'
-    rows = meta.values.get("wand", [])
-    scale_bars = []
-    for row in rows if isinstance(rows, list) else [rows]:
-        shape = isinstance(row, list) and len(row) == 3 and all(isinstance(name, str) for name in row[:2])
-        if not (shape and isinstance(row[2], int | float) and not isinstance(row[2], bool)):
-            raise meta.fail("wand", f"wand {row!r} is not [label, label, length]", remedy)
-        if not MIN_STD <= row[2] <= MAX_LENGTH or row[0] == row[1]:
-            raise meta.fail("wand", f"wand {row!r} is not a length between two labels", remedy)
-        scale_bars.append((row[0], row[1], float(row[2])))
-    return tuple(scale_bars)
+    return _read_lengths(meta, "wand", ("wand", "label"), remedy)
 
 
 def _read_distances(meta: _Table, cameras: dict[str, RigCamera]) -> tuple[tuple[str, str, float], ...]:
     remedy = 'give distances = [["cam0", "cam1", 3.42]]'
-    distances = []
-    rows = meta.values.get("distances", [])
+    return _read_lengths(meta, "distances", ("distance", "camera"), remedy, cameras)
+
+
+def _read_lengths(
+    meta: _Table, key: str, words: tuple[str, str], remedy: str, known: dict[str, RigCamera] | None = None
+) -> tuple[tuple[str, str, float], ...]:
+    """Lengths between two ends. words: for one of them and for an end. known: cameras that the ends must be."""
+    rows = meta.values.get(key, [])
+    what, end = words
+    out = []
     for row in rows if isinstance(rows, list) else [rows]:
         shape = isinstance(row, list) and len(row) == 3 and all(isinstance(name, str) for name in row[:2])
         if not (shape and isinstance(row[2], int | float) and not isinstance(row[2], bool)):
-            raise meta.fail("distances", f"distance {row!r} is not [camera, camera, length]", remedy)
+            raise meta.fail(key, f"{what} {row!r} is not [{end}, {end}, length]", remedy)
         for name in row[:2]:
-            if name not in cameras:
-                raise meta.fail("distances", f"distance to an unknown camera {name!r}", "use a camera of this file")
+            if known is not None and name not in known:
+                raise meta.fail(key, f"{what} to an unknown {end} {name!r}", f"use a {end} of this file")
         if not MIN_STD <= row[2] <= MAX_LENGTH or row[0] == row[1]:
-            raise meta.fail("distances", f"distance {row!r} is not a length between two cameras", remedy)
-        distances.append((row[0], row[1], float(row[2])))
-    return tuple(distances)
+            raise meta.fail(key, f"{what} {row!r} is not a length between two {end}s", remedy)
+        out.append((row[0], row[1], float(row[2])))
+    return tuple(out)
 
 
 def _read_up(meta: _Table, cameras: dict[str, RigCamera]) -> Floats | str | None:

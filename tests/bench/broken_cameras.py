@@ -11,7 +11,6 @@ lag, in its stated stds. Requirement: at most twice the CPU without it, named, c
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,6 +23,7 @@ from protocols.geometry import so3
 from protocols.geometry.types import Bools
 from protocols.session.calibration import Calibration
 from protocols.session.folder import read_folder
+from tests.bench.options import bench_parser
 from tests.support import rigs
 
 Breakage = Callable[[rigs.Session, str, Bools, np.random.Generator], rigs.Session]
@@ -51,8 +51,7 @@ def another_recording(session: rigs.Session, name: str, mine: Bools, random: np.
         return replace(session, pixels=pixels)
     other = rigs.random_path(np.random.default_rng([7, int(random.integers(1 << 30))]))
     true = np.array([session.true_time(name, float(t)) for t in session.time[mine]])
-    lens = session.rig.cameras[name].intrinsics
-    assert lens is not None
+    lens = session.lens(name)
     pixels = session.pixels.copy()
     pixels[mine] = lens.project(session.poses[name].camera_from_world(other.at(true)))
     return replace(session, pixels=np.nan_to_num(pixels, nan=0.0))
@@ -142,17 +141,8 @@ def recorded(folder: Path) -> rigs.Session:
 
 def without(session: rigs.Session, name: str) -> rigs.Session:
     """The session without a camera."""
-    keep = np.flatnonzero([one != name for one in session.camera])
     cameras = {one: camera for one, camera in session.rig.cameras.items() if one != name}
-    return replace(
-        session,
-        rig=replace(session.rig, cameras=cameras),
-        camera=[session.camera[i] for i in keep],
-        label=[session.label[i] for i in keep],
-        frame=session.frame[keep],
-        time=session.time[keep],
-        pixels=session.pixels[keep],
-    )
+    return replace(session, rig=replace(session.rig, cameras=cameras)).where(~session.of_camera(name))
 
 
 def timed(session: rigs.Session) -> tuple[Calibration, float]:
@@ -188,13 +178,7 @@ def names(found: Calibration, name: str) -> bool:
 
 def main() -> None:
     """Print one line a rig and breakage."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cameras", type=int, default=7)
-    parser.add_argument("--seconds", type=float, default=40.0)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--session", type=Path)
-    options = parser.parse_args()
+    options = bench_parser(__doc__, cameras=7, seconds=40.0, seeds=3, first=0, session=Path).parse_args()
     ratios, bad = [], []
     if options.session is None:
         seeds = range(options.first, options.first + options.seeds)
@@ -204,7 +188,7 @@ def main() -> None:
         tasks = [(number, real, number) for number in range(len(real.rig.cameras))]
     for seed, session, number in tasks:
         name = list(session.rig.cameras)[number]
-        mine = np.array([one == name for one in session.camera])
+        mine = session.of_camera(name)
         before, base = timed(without(session, name))
         whole = timed(session)[1]
         print(f"rig {seed}: {base:.1f} s CPU without {name}, {whole:.1f} s with it", flush=True)

@@ -25,11 +25,11 @@ import numpy as np
 
 from deploy.cli import run
 from deploy.evaluation.tracking_scores import ScoredTrack, read_ground_truth, score_tracks
-from deploy.offline.csv_table import read_csv_table
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
+from protocols.session.csv_table import read_csv_table
 from protocols.session.rig import read_rig
 from protocols.topics import TRACK
 from tests.bench.real_rigs import DEFAULT_DATA
@@ -50,7 +50,7 @@ class _HubTrack:
 def spoilt_boxes(boxes: Path, calibration: Path, spoil: float, seed: int) -> str:
     """The text of a boxes.csv with misses, noise and false boxes. spoil: their factor, 0 = as annotated."""
     table = read_csv_table(boxes, "boxes", ("camera", "frame", "time", "x", "y", "width", "height"))
-    names, frame = table.columns["camera"], table.whole("frame").tolist()
+    names, frame = table.text("camera"), table.whole("frame").tolist()
     time = table.numbers("time", 1e9).tolist()
     box = np.column_stack([table.numbers(name, 1e6) for name in ("x", "y", "width", "height")])
     rng = np.random.default_rng(seed)

@@ -73,7 +73,7 @@ def stretch(seed: int, seconds: float) -> Stretch | None:
     for name, bearing, (begin, end) in zip("ab", bearings, spans, strict=True):
         away = rng.uniform(35.0, 70.0)
         place = np.array([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(-12.0, -6.0)])
-        pose = rigs.looking_at(place, rng.normal(0.0, 1.5, 3), float(rng.normal(0.0, 0.03)))
+        pose = rigs.look_at_pose(place, rng.normal(0.0, 1.5, 3), float(rng.normal(0.0, 0.03)))
         true, given = lenses(rng)
         rate, drift, epoch = float(rng.choice(FPS)), 1.0 + 1e-6 * rng.uniform(-100.0, 100.0), rng.uniform(0.0, 1e3)
         time = begin + rng.uniform(0.0, 1.0 / rate) + np.arange(int((end - begin) * rate)) / rate

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deploy.evaluation.tracking_scores import GroundTruth, ScoredTrack, score_tracks
+from edge.scenes.common.placement import look_at_pose
 from hub.tracking.live_tracking import LiveTracking
 from hub.tracking.offline import follow
 from protocols.core.clocks import NANOSECONDS, TimeMap
@@ -28,7 +29,6 @@ from protocols.geometry.types import Bools, Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, CameraCalibration
 from tests.bench.crowd import published_positions
-from tests.support.rigs import looking_at
 
 UP = np.array([0.0, 0.0, 1.0])
 SIZE, FOCAL = (1280, 720), 900.0
@@ -97,7 +97,7 @@ def simulated(
     for index in range(cameras):
         name, angle, delay = f"cam{index}", 2.0 * np.pi * index / cameras + 0.3, lag * index / max(cameras - 1, 1)
         stand = np.array([1.7 * half * np.cos(angle), 1.7 * half * np.sin(angle), 3.0 * (1.0 + 0.25 * (index % 3))])
-        pose = looking_at(stand, 0.9 * UP)
+        pose = look_at_pose(stand, 0.9 * UP)
         wrong = Pose(so3.exp(rng.normal(0.0, turn, 3)) @ pose.rotation, stand + rng.normal(0.0, shift, 3))
         clock = 100.0 * index
         given[name] = CameraCalibration(name, lens, wrong, TimeMap(1.0, -clock), 1e-3, np.zeros(3), 1.0)

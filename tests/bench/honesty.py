@@ -113,7 +113,7 @@ def no_clock(seed: int) -> rigs.Session:
     """One camera's times follow no clock: they scatter by a third of a second, or step repeatedly."""
     rng = np.random.default_rng([seed, 8])
     session = rigs.simulate(seed, 2, seconds=20.0)
-    mine = np.array([name == "cam1" for name in session.camera])
+    mine = session.of_camera("cam1")
     time = session.time.copy()
     count = int(mine.sum())
     if seed % 2:
@@ -127,10 +127,9 @@ def one_place(seed: int) -> rigs.Session:
     """Two cameras hang in one place."""
     session = rigs.simulate(seed, 2, seconds=20.0)
     rng = np.random.default_rng([seed, 9])
-    pose = rigs.looking_at(session.poses["cam0"].position, rng.normal(0, 0.15, 3), 0.3)
-    lens = session.rig.cameras["cam1"].intrinsics
-    assert lens is not None
-    mine = np.flatnonzero([name == "cam1" for name in session.camera])
+    pose = rigs.look_at_pose(session.poses["cam0"].position, rng.normal(0, 0.15, 3), 0.3)
+    lens = session.lens("cam1")
+    mine = np.flatnonzero(session.of_camera("cam1"))
     true = np.array([session.true_time("cam1", float(t)) for t in session.time[mine]])
     pixels = session.pixels.copy()
     pixels[mine] = lens.project(pose.camera_from_world(session.paths["marker"].at(true))) + rng.normal(

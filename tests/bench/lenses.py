@@ -8,32 +8,26 @@ middle, k1, k2, p1, p2, fy 0.2 % off fx). ``z``: the error over its std, 1 (rms)
 
 from __future__ import annotations
 
-import argparse
 import sys
-from dataclasses import replace
 
 import numpy as np
 
 from hub.calibration.pipeline import calibrate
 from protocols.core.errors import Refused
+from tests.bench.options import bench_parser
 from tests.support.rigs import simulate
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sessions", type=int, default=12)
-    parser.add_argument("--cameras", type=int, default=4)
-    parser.add_argument("--start", type=int, default=50)
-    given = parser.parse_args()
+    given = bench_parser(__doc__, sessions=12, cameras=4, start=50).parse_args()
     errors: list[float] = []
     ratios: list[float] = []
     refused = 0
     for seed in range(given.start, given.start + given.sessions):
         session = simulate(seed, given.cameras, 30.0)
         lenses = {name: camera.intrinsics for name, camera in session.rig.cameras.items()}
-        blind = {name: replace(camera, intrinsics=None) for name, camera in session.rig.cameras.items()}
         try:
-            found = calibrate(replace(session.rig, cameras=blind), session.observations())
+            found = calibrate(session.without_lenses().rig, session.observations())
         except Refused as refusal:
             print(f"{seed}: refused: {refusal.reason}")
             refused += given.cameras

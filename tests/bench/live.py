@@ -15,7 +15,6 @@ import json
 import os
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,25 +127,11 @@ def _bumped(session: rigs.Session, at: float, rng: np.random.Generator) -> tuple
         vector = rng.normal(size=3)
         return np.asarray(vector / np.linalg.norm(vector))
 
-    old, lens = session.poses[BUMPED], session.rig.cameras[BUMPED].intrinsics
-    assert lens is not None
+    old = session.poses[BUMPED]
     new = Pose(so3.exp(_BUMP_RAD * direction()) @ old.rotation, old.position + _BUMP_M * direction())
-    true = session.clocks[BUMPED].clock_rate * session.time + session.clocks[BUMPED].time_offset
-    after = (np.array(session.camera) == BUMPED) & (true >= at)
-    points = session.paths[DEFAULT_LABEL].at(true[after])
-    pixels = session.pixels.copy()
-    pixels[after] += lens.project(new.camera_from_world(points)) - lens.project(old.camera_from_world(points))
-    inside = np.all((pixels >= 0) & (pixels < rigs.SIZE), axis=1)
-    kept = np.flatnonzero(inside)
-    moved = replace(
-        session,
-        camera=[session.camera[i] for i in kept],
-        label=[session.label[i] for i in kept],
-        frame=session.frame[kept],
-        time=session.time[kept],
-        pixels=pixels[kept],
-    )
-    return Bump(BUMPED, at, {**session.poses, BUMPED: new}), moved
+    moved = session.moved(BUMPED, at, new)
+    moved = moved.where(np.all((moved.pixels >= 0) & (moved.pixels < rigs.SIZE), axis=1))
+    return Bump(BUMPED, at, moved.poses), moved
 
 
 def measure(reference: Reference, seconds: float, seed: int, refine_lenses: bool = False) -> dict[str, Any]:

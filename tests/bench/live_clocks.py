@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -34,6 +34,7 @@ from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402
 from protocols.messages import syncline_pb2 as pb  # noqa: E402
 from tests.support import rigs  # noqa: E402
+from tests.support.session_messages import info_messages, row_messages  # noqa: E402
 
 CHANGED = "cam1"
 CHANGES_AT_S = 30.0
@@ -58,40 +59,22 @@ def stream(
     session: rigs.Session, change: Change, seed: int, scatter_s: float = _SCATTER_S
 ) -> Iterator[tuple[float, pb.Observation | pb.CameraInfo]]:
     """(true time, message) in the order in which they were made; arrivals are _DELAY_S after it, with a scatter."""
-    for name, camera in session.rig.cameras.items():
-        lens = camera.intrinsics
-        assert lens is not None
-        yield (
-            0.0,
-            pb.CameraInfo(
-                schema_version=1,
-                camera=name,
-                boot_id=f"boot-{name}",
-                width=lens.width,
-                height=lens.height,
-                fps=camera.fps,
-                matrix=lens.matrix.ravel(),
-                distortions=lens.distortions,
-            ),
-        )
-    true = np.array([session.true_time(c, float(t)) for c, t in zip(session.camera, session.time, strict=True)])
+    for info in info_messages(session, _boot):
+        yield 0.0, info
+    true = session.true
     scatter = np.random.default_rng([seed, 3]).exponential(scatter_s, len(true))
-    counts: dict[str, int] = {}
-    for i in np.argsort(true):
-        name = session.camera[i]
-        counts[name] = counts.get(name, -1) + 1
-        own = float(session.time[i])
-        own = change.shown(own, float(true[i])) if name == CHANGED else own
-        message = pb.Observation(
-            schema_version=1,
-            camera=name,
-            boot_id=f"boot-{name}",
-            sequence=counts[name],
-            frame=int(session.frame[i]),
-            device_time_ns=round(own * NANOSECONDS),
-            detections=[pb.Detection(u=session.pixels[i, 0], v=session.pixels[i, 1], score=1.0, label="marker")],
-        )
-        yield float(true[i]) + float(scatter[i]), message
+
+    def shown(row: int) -> float:
+        own = float(session.time[row])
+        return change.shown(own, float(true[row])) if session.camera[row] == CHANGED else own
+
+    order = np.argsort(true).tolist()
+    for row, message in zip(order, row_messages(session, _boot, order, shown), strict=True):
+        yield float(true[row]) + float(scatter[row]), message
+
+
+def _boot(name: str) -> str:
+    return f"boot-{name}"
 
 
 def window(seeds: range) -> None:
@@ -108,17 +91,9 @@ def window(seeds: range) -> None:
         hub.tick(1e3, final=True)
         keep = np.zeros(len(session.time), dtype=np.bool_)
         for name in session.rig.cameras:
-            mine = np.array([camera == name for camera in session.camera])
+            mine = session.of_camera(name)
             keep |= mine & (session.time >= session.time[mine].max() - WINDOW_S)
-        at = np.flatnonzero(keep)
-        late = replace(
-            session,
-            camera=[session.camera[i] for i in at],
-            label=[session.label[i] for i in at],
-            frame=session.frame[at],
-            time=session.time[at],
-            pixels=session.pixels[at],
-        )
+        late = session.where(keep)
         try:
             found = calibrate(session.rig, late.observations())
         except Refused:

@@ -101,6 +101,19 @@ def our_write(path: Path, items: list[pb.Observation], views: bool) -> None:
             log.write(OBSERVATION, "cam0", "local", item, index)
 
 
+def median_cpu(folder: Path, rows: dict[str, Callable[[Path], object]], rounds: int) -> dict[str, float]:
+    """CPU seconds of each row, the median of several rounds in turn."""
+    times: dict[str, list[float]] = {name: [] for name in rows}
+    for _ in range(rounds):
+        for name, run in rows.items():
+            path = folder / "x.mcap"
+            path.unlink(missing_ok=True)
+            began = time.process_time()
+            run(path)
+            times[name].append(time.process_time() - began)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
 def rates(folder: Path, count: int, rounds: int) -> None:
     items = messages(count)
     payloads = [encode(item) for item in items]
@@ -115,17 +128,9 @@ def rates(folder: Path, count: int, rounds: int) -> None:
         "recover": lambda path: recover(folder / "kept.mcap", path),
     }
     our_write(folder / "kept.mcap", items, False)
-    times: dict[str, list[float]] = {name: [] for name in rows}
-    for _ in range(rounds):
-        for name, run in rows.items():
-            path = folder / "x.mcap"
-            path.unlink(missing_ok=True)
-            began = time.process_time()
-            run(path)
-            times[name].append(time.process_time() - began)
+    medians = median_cpu(folder, rows, rounds)
     size = statistics.mean(len(payload) for payload in payloads)
     print(f"{count} observations of {size:.0f} bytes; CPU time, median of {rounds}")
-    medians = {name: statistics.median(values) for name, values in times.items()}
     for name, seconds in medians.items():
         print(f"  {name:34} {count / seconds:>10,.0f}/s")
     raw, copied, raw_encoding, ours, viewed = list(medians.values())[:5]
@@ -147,15 +152,7 @@ def bandwidth(folder: Path, count: int, rounds: int) -> None:
         "LogWriter.write": lambda path: ours(path, False),
         "LogWriter.write, with views": lambda path: ours(path, True),
     }
-    times: dict[str, list[float]] = {name: [] for name in rows}
-    for _ in range(rounds):
-        for name, run in rows.items():
-            path = folder / "x.mcap"
-            path.unlink(missing_ok=True)
-            began = time.process_time()
-            run(path)
-            times[name].append(time.process_time() - began)
-    medians = {name: statistics.median(values) for name, values in times.items()}
+    medians = median_cpu(folder, rows, rounds)
     print(f"{count} images of 100 KB; CPU time, median of {rounds}")
     for name, seconds in medians.items():
         print(f"  {name:34} {count * 0.1 / seconds:>10,.0f} MB/s")

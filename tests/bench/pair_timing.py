@@ -31,10 +31,8 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 
 from hub.sync.pair_solver import solve_pair  # noqa: E402
-from hub.trajectory.image_tracks import smooth_track  # noqa: E402
 from hub.two_view.relative_pose import fundamental_from  # noqa: E402
 from tests.bench.pair_trials import (  # noqa: E402
-    FOCAL,
     MATRIX,
     Regime,
     Trial,
@@ -117,14 +115,11 @@ class Outcome:
 def run(trial: Trial, calibrated: bool, related: bool = True) -> Outcome:
     """Smooth, solve and score one trial. related: whether the two cameras saw the same motion."""
     begin = time.process_time()
-    tracks = []
-    for view in trial.views:
-        normalised = (view.pixels - MATRIX[:2, 2]) / FOCAL
-        tracks.append(smooth_track(view.time, normalised, FOCAL))
+    tracks = trial.smoothed()
     smoothed = time.process_time()
-    a, b = tracks
-    if a is None or b is None:
+    if len(tracks) < 2:
         return Outcome("no track", np.inf, np.inf, np.inf, np.nan, 1e3 * (smoothed - begin), 0.0)
+    a, b = tracks
     answer = solve_pair({"": a}, {"": b}, ("a", "b"), calibrated=calibrated, thorough=True)
     solved = time.process_time()
     spent = 1e3 * (smoothed - begin), 1e3 * (solved - smoothed)

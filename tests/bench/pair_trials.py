@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from edge.scenes.common.placement import look_at_pose
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from hub.two_view.relative_pose import RelativePose, fundamental_from, orthogonal_axes, relative_pose_between
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
-from tests.support.rigs import looking_at
 
 FOCAL = 700.0
 SIZE = (800, 600)
@@ -52,6 +53,11 @@ class Trial:
     def true(self, camera: int, shown: Floats) -> Floats:
         """True times (n,) at which a camera's clock shows ``shown``."""
         return (shown - self.clock_offset[camera]) / self.clock_rate[camera]
+
+    def smoothed(self) -> list[SmoothTrack]:
+        """The tracks of both cameras; fewer where one of them is none."""
+        found = [smooth_track(view.time, (view.pixels - MATRIX[:2, 2]) / FOCAL, FOCAL) for view in self.views]
+        return [track for track in found if track is not None]
 
     @property
     def overlap(self) -> tuple[float, float]:
@@ -233,7 +239,7 @@ def _random_rig(rng: np.random.Generator) -> tuple[Pose, Pose]:
         if 30.0 <= np.rad2deg(np.arccos(directions[0] @ directions[1])) <= 150.0:
             break
     return tuple(  # type: ignore[return-value]
-        looking_at(direction * rng.uniform(500, 900), rng.normal(0, 15, 3), rng.normal(0, 0.15))
+        look_at_pose(direction * rng.uniform(500, 900), rng.normal(0, 15, 3), rng.normal(0, 0.15))
         for direction in directions
     )
 

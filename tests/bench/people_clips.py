@@ -10,7 +10,6 @@ the command refuses them, which count no people. CPU milliseconds per frame, of 
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import cv2
@@ -19,6 +18,7 @@ import numpy as np
 from edge.detectors.base import Detection
 from edge.detectors.people.person import PersonDetector
 from edge.offline.moving import MAX_MOVING_SHARE
+from tests.bench.options import bench_parser
 from tests.support.people_boxes import score_boxes
 from tests.support.street import KINDS, StreetClip, street_clip
 
@@ -38,11 +38,7 @@ def people_of(clip: StreetClip, *, twice: bool) -> list[list[Detection]] | None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=8)
-    parser.add_argument("--first-seed", type=int, default=1)
-    parser.add_argument("--only", default="", help="kinds whose name contains this")
-    options = parser.parse_args()
+    options = bench_parser(__doc__, seeds=8, first_seed=1, only=("", "kinds whose name contains this")).parse_args()
     cv2.setNumThreads(1)
     print("| clip | people | | counted, mean (most) | precision | recall | refused | CPU ms a frame |")
     print("|---|---|---|---|---|---|---|---|")

@@ -21,6 +21,7 @@ from deploy.evaluation.clear_mot import EvaluationFrame, MotScores, clear_mot
 from edge import scenes
 from edge.agents.predictions import PredictionSubscriber
 from edge.scenes import renderer_for
+from edge.scenes.common.placement import look_at_pose
 from edge.scenes.people.scene import PeopleScene
 from hub.calibration.pipeline import calibrate
 from hub.tracking.calibration.people import PeopleTracklets
@@ -40,7 +41,6 @@ from protocols.session.calibration import Calibration
 from protocols.session.rig import Rig, RigCamera
 from protocols.topics import PREDICTION
 from tests.support.people_traffic import Faults, Traffic, cameras_of, film
-from tests.support.rigs import looking_at
 
 UP = np.array([0.0, 0.0, 1.0])
 REACH_M = 0.5
@@ -152,7 +152,7 @@ def nearest_frames(seed: int, seconds: float = 25.0, fps: float = 10.0, noise_px
         angle = 2 * np.pi * (i + rng.uniform(-0.2, 0.2)) / 5
         place = np.array([5.0 * np.cos(angle), 5.0 * np.sin(angle), rng.uniform(1.8, 2.6)])
         name = f"cam{i}"
-        camera = TrackingCamera(name, lens, looking_at(place, np.array([0.0, 0.0, 1.0])), TimeMap(), 1e-4)
+        camera = TrackingCamera(name, lens, look_at_pose(place, np.array([0.0, 0.0, 1.0])), TimeMap(), 1e-4)
         cameras[name] = camera
         phase = rng.uniform(0, 1 / fps)
         for number, moment in enumerate((phase + np.arange(int(seconds * fps)) / fps).tolist()):

@@ -10,7 +10,6 @@ shows whether what that says of it holds. One machine stands in for many: feeder
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -25,6 +24,7 @@ from typing import Any
 
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from tests.bench.load import resident_mb
+from tests.bench.options import bench_parser
 from tests.bench.real_rigs import REPOSITORY
 
 _ASKED = 10_000
@@ -174,14 +174,8 @@ def needed(hub: Cost, router: Cost, hz: float, cameras: int = _ASKED) -> tuple[i
 
 def main() -> None:
     """Measure, report, check."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--hubs", type=int, default=4)
-    parser.add_argument("--cameras", type=int, default=250, help="of each hub")
-    parser.add_argument("--hz", type=float, default=5.0)
-    parser.add_argument("--seconds", type=float, default=12.0)
-    parser.add_argument("--quick", action="store_true")
+    parser = bench_parser(__doc__, hubs=4, cameras=(250, "of each hub"), hz=5.0, seconds=12.0, quick=False, endpoint="")
     parser.add_argument("--role", choices=("router",))
-    parser.add_argument("--endpoint", default="")
     words = parser.parse_args()
     if words.role == "router":
         with Router(words.endpoint):

@@ -11,7 +11,6 @@ none.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 
@@ -26,17 +25,14 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
+from tests.bench.options import bench_parser
 from tests.support.walking_people import JOINTS, PeopleWorld, people_world
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = bench_parser(__doc__, people=3, seconds=30.0, noise=2.0, no_lenses=False)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--people", type=int, default=3)
     parser.add_argument("--fps", type=float, nargs="+", default=[25.0, 30.0, 25.0])
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--noise", type=float, default=2.0)
-    parser.add_argument("--no-lenses", action="store_true")
     options = parser.parse_args()
     errors, invented = [np.zeros((0, 4))], 0
     for seed in options.seeds:

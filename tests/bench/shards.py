@@ -11,7 +11,6 @@ killed, and then the one that leads.
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import signal
 import subprocess
@@ -45,6 +44,7 @@ from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PART, SHARD, SOLVER_EVENT, TRACK
+from tests.bench.options import bench_parser
 from tests.support.long_street import street
 
 Arrivals = Mapping[str, ExternalClockPrior]
@@ -295,14 +295,7 @@ def live(cameras: int, hubs: int, seconds: float, fps: float, seed: int) -> None
 
 def main() -> None:
     """Choose."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cameras", type=int)
-    parser.add_argument("--hubs", type=int, default=4)
-    parser.add_argument("--seconds", type=float)
-    parser.add_argument("--fps", type=float, default=15.0)
-    parser.add_argument("--seed", type=int, default=5)
-    parser.add_argument("--live", action="store_true")
-    words = parser.parse_args()
+    words = bench_parser(__doc__, cameras=int, hubs=4, seconds=float, fps=15.0, seed=5, live=False).parse_args()
     if words.live:
         live(words.cameras or 48, words.hubs, words.seconds or 60.0, words.fps, words.seed)
         return

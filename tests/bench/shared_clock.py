@@ -9,14 +9,13 @@ given without std. The optimum is `pose_worlds.joint_optimum` over the same pixe
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 
 from hub.calibration.pipeline import calibrate
 from protocols.geometry.camera import Intrinsics
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
+from tests.bench.options import bench_parser
 from tests.bench.pose_worlds import (
     FOCAL,
     Sightings,
@@ -67,12 +66,7 @@ def section_4_session(
 
 def main() -> None:
     """Print a line a seed and the means."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=100)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--points", type=int, default=2000)
-    parser.add_argument("--solvers", default="joint,distributed")
-    options = parser.parse_args()
+    options = bench_parser(__doc__, seeds=100, first=0, points=2000, solvers="joint,distributed").parse_args()
     solvers = options.solvers.split(",")
     table = []
     for seed in range(options.first, options.first + options.seeds):

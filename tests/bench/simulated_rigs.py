@@ -187,7 +187,7 @@ def field(seed: int, cameras: int = 20, seconds: float = 600.0, length: float = 
     for i, name in enumerate(names):
         along = -0.5 * length + length * (i // 2 + 0.5) / (0.5 * cameras) + rng.normal(0, 0.5)
         place = np.array([along, (1 if i % 2 else -1) * rng.uniform(6, 8), rng.uniform(1, 3)])
-        poses[name] = rigs.looking_at(place, np.array([along + rng.normal(), 0.0, 0.0]), rng.normal(0, 0.05))
+        poses[name] = rigs.look_at_pose(place, np.array([along + rng.normal(), 0.0, 0.0]), rng.normal(0, 0.05))
         lens, rate = rigs.random_lens(rng), (30.0, 25.0, 29.97, 50.0)[i % 4]
         drift, clock_origin = 1.0 + 1e-6 * rng.uniform(-100, 100), rigs.EPOCHS[i % len(rigs.EPOCHS)]
         clocks[name] = TimeMap(1.0 / drift, -clock_origin / drift)

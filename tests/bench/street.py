@@ -9,7 +9,6 @@ than one of CPU. A transport's CPU is not in it.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from bisect import bisect_left
@@ -38,6 +37,7 @@ from protocols.session.rig import Rig
 from protocols.topics import OBSERVATION
 from protocols.validation.codec import encode
 from tests.bench.load import resident_mb
+from tests.bench.options import bench_parser
 from tests.support.long_street import street
 
 _ROUND_S = 0.05
@@ -161,12 +161,7 @@ def live(
 
 def main() -> int:
     """Simulate, calibrate and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cameras", type=int, default=60)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--seed", type=int, default=3)
-    parser.add_argument("--fps", type=float, default=30.0)
-    parser.add_argument("--live", action="store_true")
+    parser = bench_parser(__doc__, cameras=60, seconds=30.0, seed=3, fps=30.0, live=False)
     parser.add_argument("--without", choices=("tracks", "smoothing"), help="of what a hub makes live")
     options = parser.parse_args()
     rig, observations, arrivals, poses, clocks = street(options.seed, options.cameras, options.seconds, options.fps)

@@ -45,6 +45,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import fit_similarity
 from protocols.geometry.types import Floats
 from protocols.session.calibration import read_calibration
+from tests.bench.options import bench_parser
 from tests.support.videos import write_video_frames
 
 FISHEYES = (1, 4)
@@ -252,15 +253,10 @@ def focal_scores(given: argparse.Namespace, size: tuple[int, int]) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--cameras", type=int, default=6)
-    parser.add_argument("--size", default="1920x1080")
-    parser.add_argument("--seed", type=int, default=400)
-    parser.add_argument("--crf", type=int, default=20)
+    parser = bench_parser(
+        __doc__, seconds=60.0, cameras=6, size="1920x1080", seed=400, crf=20, render_only=False, folders=0
+    )
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "syncline-video-folder")
-    parser.add_argument("--render-only", action="store_true")
-    parser.add_argument("--folders", type=int, default=0)
     given = parser.parse_args()
     width, height = (int(part) for part in given.size.split("x"))
     if given.folders:

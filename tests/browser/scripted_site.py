@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, STATUS, TRACK
 from tests.support.samples import MATRIX, camera_info, observation, picture, track
+from tests.support.threads import running
 
 NAMES = ("cam0", "cam1", "cam2")
 _TRACK_HZ, _CAMERA_EVERY, _SLOW_EVERY = 60, 3, 30
@@ -171,25 +172,17 @@ def pixel(name: str, point: Floats) -> tuple[float, float]:
 @contextmanager
 def scripted_site(*, publishing: bool = True) -> Iterator[tuple[ScriptedSite, ViewServer]]:
     """A running site and its view. publishing: False = nothing is on the bus."""
-    network, stop, view = MemoryHub(), threading.Event(), ViewServer(port=0)
+    network, view = MemoryHub(), ViewServer(port=0)
     with MemoryBus(network) as agents, MemoryBus(network) as bus:
         site = ScriptedSite(agents)
 
-        def run() -> None:
+        def run(stop: threading.Event) -> None:
             start = time.monotonic()
             tick = 0
             while not stop.wait(max(0.0, start + tick / _TRACK_HZ - time.monotonic())):
                 site.publish(tick)
                 tick += 1
 
-        threads = [threading.Thread(target=run_view, args=(bus, view, stop))]
-        threads += [threading.Thread(target=run)] if publishing else []
-        for thread in threads:
-            thread.start()
-        try:
+        works = [lambda stop: run_view(bus, view, stop), run]
+        with closing(view), running(*works[: 1 + publishing]):
             yield site, view
-        finally:
-            stop.set()
-            for thread in threads:
-                thread.join(20.0)
-            view.close()

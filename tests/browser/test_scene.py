@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PICTURE, TAR
 from tests.browser.conftest import Tab
 from tests.integration.live.test_view_server import TOKEN, solved
 from tests.support.samples import camera_info, eventually, observation, picture, target_state, uav_info
+from tests.support.threads import running
 from tests.unit.hub.view.test_state import log_of
 
 _BLUE = np.array([190, 110, 30])  # BGR of a camera that is solved
@@ -44,29 +46,24 @@ def _blue(tab: Tab, name: str) -> tuple[int, np.ndarray[Any, Any]]:
 
 
 def test_a_frustum_moves_when_its_camera_has_moved(tab: Tab) -> None:
-    network, stop, view = MemoryHub(), threading.Event(), ViewServer(port=0)
-    with MemoryBus(network) as agents, MemoryBus(network) as bus:
-        loop = threading.Thread(target=run_view, args=(bus, view, stop))
-        loop.start()
-        frames = threading.Thread(target=film, args=(agents, stop))
-        frames.start()
-        try:
-            hub = agents.publisher(CALIBRATION, "hub")
-            hub.put(solved((0, 0, 0), (2, 0, 0)))
-            tab.page.goto(view.address)
-            tab.page.wait_for_function("document.querySelectorAll('[data-state=calibrated]').length === 2")
-            count, place = blue(tab, "frusta-before")
-            assert count > 100, "the frusta are in view"
-            hub.put(solved((0, 0, 0), (2, 0.6, 0), revision=2))
-            assert eventually(lambda: np.allclose(view.scene._frusta["cam1"].position, [2, 0.6, 0]))
-            moved, elsewhere = blue(tab, "frusta-after")
-            assert moved > 100
-            assert float(np.linalg.norm(elsewhere - place)) > 3.0
-        finally:
-            stop.set()
-            loop.join(20.0)
-            frames.join(20.0)
-            view.close()
+    network, view = MemoryHub(), ViewServer(port=0)
+    with (
+        MemoryBus(network) as agents,
+        MemoryBus(network) as bus,
+        closing(view),
+        running(lambda stop: run_view(bus, view, stop), lambda stop: film(agents, stop)),
+    ):
+        hub = agents.publisher(CALIBRATION, "hub")
+        hub.put(solved((0, 0, 0), (2, 0, 0)))
+        tab.page.goto(view.address)
+        tab.page.wait_for_function("document.querySelectorAll('[data-state=calibrated]').length === 2")
+        count, place = blue(tab, "frusta-before")
+        assert count > 100, "the frusta are in view"
+        hub.put(solved((0, 0, 0), (2, 0.6, 0), revision=2))
+        assert eventually(lambda: np.allclose(view.scene._frusta["cam1"].position, [2, 0.6, 0]))
+        moved, elsewhere = blue(tab, "frusta-after")
+        assert moved > 100
+        assert float(np.linalg.norm(elsewhere - place)) > 3.0
 
 
 def film(agents: MemoryBus, stop: threading.Event) -> None:
@@ -84,12 +81,10 @@ def film(agents: MemoryBus, stop: threading.Event) -> None:
 
 def test_a_drone_with_the_target_outside_its_image(tab: Tab) -> None:
     """The panel describes it, and the page draws the estimate to the right of the image."""
-    network, stop, view = MemoryHub(), threading.Event(), ViewServer(port=0)
+    network, view = MemoryHub(), ViewServer(port=0)
     good, data = cv2.imencode(".jpg", np.full((240, 320, 3), 128, np.uint8))
     assert good
     with MemoryBus(network) as agents, MemoryBus(network) as bus:
-        loop = threading.Thread(target=run_view, args=(bus, view, stop))
-        loop.start()
         publishers = {topic: agents.publisher(topic, "drone") for topic in (UAV_INFO, TARGET, PICTURE)}
 
         def fly(state: str, x: float, sequence: int) -> None:
@@ -100,7 +95,7 @@ def test_a_drone_with_the_target_outside_its_image(tab: Tab) -> None:
             publishers[TARGET].put(target)
             publishers[PICTURE].put(shown)
 
-        try:
+        with closing(view), running(lambda stop: run_view(bus, view, stop)):
             tab.page.goto(view.address)
             assert eventually(lambda: publishers[PICTURE].wait_matched(0.0)), (
                 "images are subscribed to while a browser is open"
@@ -120,10 +115,6 @@ def test_a_drone_with_the_target_outside_its_image(tab: Tab) -> None:
             assert len(orange) > 50
             assert len(grey) > 10_000
             assert orange[:, 1].min() > grey[:, 1].max(), "outside, on the right"
-        finally:
-            stop.set()
-            loop.join(20.0)
-            view.close()
 
 
 def test_without_the_token_the_browser_has_no_access(chromium: Any) -> None:
@@ -143,16 +134,13 @@ def test_without_the_token_the_browser_has_no_access(chromium: Any) -> None:
 
 
 def test_a_log_can_be_moved_along_its_timeline(tab: Tab, tmp_path: Path) -> None:
-    stop = threading.Event()
     views: list[ViewServer] = []
 
     def serve(player: Any) -> ViewServer:
         views.append(ViewServer(port=0, player=player))
         return views[0]
 
-    loop = threading.Thread(target=run_replay, args=(LogRecording(log_of(tmp_path / "a.mcap")), serve, stop))
-    loop.start()
-    try:
+    with running(lambda stop: run_replay(LogRecording(log_of(tmp_path / "a.mcap")), serve, stop)):
         assert eventually(lambda: bool(views))
         page = tab.page
         page.goto(views[0].address)
@@ -171,6 +159,3 @@ def test_a_log_can_be_moved_along_its_timeline(tab: Tab, tmp_path: Path) -> None
         time.press("Enter")
         page.wait_for_selector("[data-state=collecting]")
         assert page.get_by_role("button", name="Recalibrate").count() == 0, "a recording accepts no commands"
-    finally:
-        stop.set()
-        loop.join(20.0)

@@ -183,35 +183,19 @@ def fuzz_config(count: int, seed: int) -> Counter[str]:
     """``count`` inputs for the configuration reader: InputError, or a configuration."""
     from deploy.config.agents import CameraConfig
     from deploy.config.file import load
-    from protocols.core.errors import InputError
 
-    rng, counts = random.Random(f"{seed} config"), Counter[str]()
     valid = [
         b'id = "cam0"\nsite = "yard"\n[bus]\nmode = "client"\nconnect = ["tcp/127.0.0.1:7447"]\noutage_s = 60.0\n',
         b'id = "cam1"\ndriver = "simulated"\n[simulated]\nscene = "marker"\nseed = 3\ncameras = 4\n',
         b'id = "cam2"\n[bus]\noutage_s = 0x' + b"F" * 40 + b"\n[" + b'"!".' * 40 + b"a]\n",
     ]
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "camera.toml"
-        for _ in range(count):
-            file.write_bytes(damaged(rng, valid))
-            try:
-                load(file, CameraConfig)
-                counts["let in"] += 1
-            except InputError as error:
-                _one_line(str(error))
-                counts["refused"] += 1
-            except Exception as error:
-                raise AssertionError(f"config: {type(error).__name__} on {file.read_bytes().hex()}") from error
-    return counts
+    return _read_damaged("camera.toml", valid, count, seed, lambda file: load(file, CameraConfig))
 
 
 def fuzz_rig(count: int, seed: int) -> Counter[str]:
     """``count`` inputs for the reader of rig.toml: InputError, or a rig whose lenses take any pixel."""
-    from protocols.core.errors import InputError
     from protocols.session.rig import read_rig
 
-    rng, counts = random.Random(f"{seed} rig"), Counter[str]()
     lens = b"size = [640, 480]\nfps = 1e5\nmatrix = [[500.0, 0, 320.0], [0, 1e7, 240.0], [0, 0, 1]]\n"
     valid = [
         b"[cam0]\n"
@@ -224,20 +208,33 @@ def fuzz_rig(count: int, seed: int) -> Counter[str]:
         b"".join(b"[cam%d]\nsize = [1, 65535]\n" % number for number in range(40)) + b"[metadata]\nunits = 'mm'\n",
     ]
     pixels = np.array([[0.0, 0.0], [1e6, -1e6], [320.0, 240.0]])
-    with TemporaryDirectory() as folder, np.errstate(all="ignore"):
-        file = Path(folder) / "rig.toml"
+
+    def read(file: Path) -> None:
+        for camera in read_rig(file).cameras.values():
+            if camera.intrinsics is not None:
+                camera.intrinsics.unproject(pixels)
+
+    with np.errstate(all="ignore"):
+        return _read_damaged("rig.toml", valid, count, seed, read)
+
+
+def _read_damaged(name: str, valid: list[bytes], count: int, seed: int, read: Callable[[Path], object]) -> Counter[str]:
+    """Read damaged files: each is let in, or refused in one line."""
+    from protocols.core.errors import InputError
+
+    rng, counts = random.Random(f"{seed} {name}"), Counter[str]()
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / name
         for _ in range(count):
             file.write_bytes(damaged(rng, valid))
             try:
-                for camera in read_rig(file).cameras.values():
-                    if camera.intrinsics is not None:
-                        camera.intrinsics.unproject(pixels)
+                read(file)
                 counts["let in"] += 1
             except InputError as error:
                 _one_line(str(error))
                 counts["refused"] += 1
             except Exception as error:
-                raise AssertionError(f"rig: {type(error).__name__} on {file.read_bytes().hex()}") from error
+                raise AssertionError(f"{name}: {type(error).__name__} on {file.read_bytes().hex()}") from error
     return counts
 
 

@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from protocols.bus.router.zenoh_router import free_endpoint
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -79,6 +81,16 @@ def router(folder: Path, endpoint: str, namespace: str = "") -> Process:
     process = Process("-m", "deploy", "router", str(config), namespace=namespace, stderr=folder / "router.txt")
     assert process.line().startswith("relays at")
     return process
+
+
+@contextmanager
+def flow(folder: Path) -> Iterator[tuple[str, Process, Process, Process]]:
+    """An endpoint with its router, a receiver, and a camera at 30 Hz."""
+    endpoint = free_endpoint()
+    with router(folder, endpoint) as routing, receiver(endpoint) as receiving, publisher(endpoint) as sending:
+        receiving.ready()
+        assert sending.ready()["ready"]
+        yield endpoint, routing, receiving, sending
 
 
 def wait_until(condition: Any, timeout_s: float = 20.0) -> float:

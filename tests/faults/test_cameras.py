@@ -5,11 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
 
-import cv2
 import numpy as np
 import pytest
 
@@ -23,6 +20,9 @@ from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION, STATUS
 from tests.faults.matrix import measured
+from tests.faults.processes import wait_until
+from tests.support.mjpeg_camera import MjpegCamera
+from tests.support.threads import running
 
 PERIOD_S = 1 / 30
 
@@ -82,10 +82,8 @@ class Bright:
 )
 def test_a_camera_without_usable_frames_is_reported_and_publishes_nothing_stale(kind: str, words: str) -> None:
     hub = MemoryHub()
-    device, stop = Flawed(kind), threading.Event()
+    device = Flawed(kind)
     observations, statuses = MemoryBus(hub).subscribe(OBSERVATION), MemoryBus(hub).subscribe(STATUS)
-    agent = threading.Thread(target=_run, args=(device, MemoryBus(hub), stop), daemon=True)
-    agent.start()
     received: list[pb.AgentStatus] = []
 
     def has_received(condition: Callable[[pb.AgentStatus], bool]) -> Callable[[], bool]:
@@ -95,25 +93,24 @@ def test_a_camera_without_usable_frames_is_reported_and_publishes_nothing_stale(
 
         return check
 
-    _until(has_received(lambda status: status.state == "running"))
-    time.sleep(0.5)
-    assert len(observations.drain()) > 5
-    device.flaw.set()
-    began = time.monotonic()
-    seconds = _until(has_received(lambda status: status.state == "degraded" and words in status.message))
-    time.sleep(1.0)
-    stale = [
-        item.message
-        for item in observations.drain()
-        if item.message.device_time_ns * 1e-9 > began + 2 * PERIOD_S and len(item.message.detections)  # type: ignore[attr-defined]
-    ]
-    if kind not in ("stalled", "unplugged"):
-        received.clear()
-        device.flaw.clear()
-        _until(has_received(lambda status: status.state == "running"))
-        assert len(observations.drain()) >= 0
-    stop.set()
-    agent.join(10.0)
+    with running(CameraAgent(device, Bright(), MemoryBus(hub), "cam0").run):
+        wait_until(has_received(lambda status: status.state == "running"))
+        time.sleep(0.5)
+        assert len(observations.drain()) > 5
+        device.flaw.set()
+        began = time.monotonic()
+        seconds = wait_until(has_received(lambda status: status.state == "degraded" and words in status.message))
+        time.sleep(1.0)
+        stale = [
+            item.message
+            for item in observations.drain()
+            if item.message.device_time_ns * 1e-9 > began + 2 * PERIOD_S and len(item.message.detections)  # type: ignore[attr-defined]
+        ]
+        if kind not in ("stalled", "unplugged"):
+            received.clear()
+            device.flaw.clear()
+            wait_until(has_received(lambda status: status.state == "running"))
+            assert len(observations.drain()) >= 0
     measured(
         f"camera {kind}",
         "reported ≤ 2 s, nothing stale published",
@@ -123,51 +120,12 @@ def test_a_camera_without_usable_frames_is_reported_and_publishes_nothing_stale(
     assert stale == []
 
 
-class _Stream(BaseHTTPRequestHandler):
-    """An IP camera: 25 noisy images per second, as MJPEG."""
-
-    def do_GET(self) -> None:
-        self.send_response(200)
-        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-        self.end_headers()
-        rng = np.random.default_rng(0)
-        with suppress(OSError):
-            while not PULLED.wait(0.04):
-                picture = cv2.imencode(".jpg", rng.integers(40, 200, (48, 64, 3), dtype=np.uint8))[1].tobytes()
-                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
-                self.wfile.write(head.encode() + picture + b"\r\n")
-
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-PULLED = threading.Event()
-
-
-def _plugged(port: int = 0) -> ThreadingHTTPServer:
-    PULLED.clear()
-    server = ThreadingHTTPServer(("127.0.0.1", port), _Stream)
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    return server
-
-
-def _pull(server: ThreadingHTTPServer) -> None:
-    PULLED.set()
-    server.shutdown()
-    server.server_close()
-
-
 def test_a_network_camera_that_was_unplugged_comes_back_in_the_same_run_of_its_agent() -> None:
     """The agent used to end with status 2 after 5 s; its restart took a new boot id, and with it the timing."""
-    server = _plugged()
+    server = MjpegCamera()
     hub = MemoryHub()
     observations, statuses = MemoryBus(hub).subscribe(OBSERVATION), MemoryBus(hub).subscribe(STATUS)
-    camera, stop = OpenCvCamera(f"http://127.0.0.1:{server.server_port}/"), threading.Event()
-    agent = threading.Thread(
-        target=CameraAgent(camera, Bright(), MemoryBus(hub), "cam0").run, args=(stop,), daemon=True
-    )
-    agent.start()
+    camera = OpenCvCamera(server.url)
     seen: list[pb.Observation] = []
     received: list[pb.AgentStatus] = []
 
@@ -176,23 +134,20 @@ def test_a_network_camera_that_was_unplugged_comes_back_in_the_same_run_of_its_a
         received.extend(item.message for item in statuses.drain())  # type: ignore[misc]
 
     def until(condition: Callable[[], bool]) -> float:
-        return _until(lambda: (check(), condition())[1])  # type: ignore[func-returns-value]
+        return wait_until(lambda: (check(), condition())[1])  # type: ignore[func-returns-value]
 
-    try:
+    with running(CameraAgent(camera, Bright(), MemoryBus(hub), "cam0").run):
         until(lambda: len(seen) > 25)
-        _pull(server)
+        server.unplug()
         flagged = until(lambda: bool(received) and received[-1].state == "degraded")
         until(lambda: camera.disconnected)
         time.sleep(2.5)  # for several tries in vain
         check()
         before, count = seen[-1], len(seen)
-        server = _plugged(server.server_port)
+        server = MjpegCamera(server.port)
         back = until(lambda: len(seen) > count + 10)
         until(lambda: received[-1].state == "running" and received[-1].counters["reconnections"] == 1)
-    finally:
-        stop.set()
-        agent.join(10.0)
-        _pull(server)
+    server.unplug()
     measured(
         "camera unplugged and back",
         "reported ≤ 2 s, back ≤ 5 s, same run",
@@ -222,15 +177,3 @@ def test_a_camera_that_is_gone_for_good_ends_its_agent_with_the_reason() -> None
     device.gone = True
     with pytest.raises(InputError, match="camera cam0 is gone; plug it in"):
         CameraAgent(device, Bright(), MemoryBus(MemoryHub()), "cam0").run(threading.Event())
-
-
-def _run(device: Flawed, bus: MemoryBus, stop: threading.Event) -> None:
-    CameraAgent(device, Bright(), bus, "cam0").run(stop)
-
-
-def _until(condition: Callable[[], bool], timeout_s: float = 10.0) -> float:
-    began = time.monotonic()
-    while not condition():
-        assert time.monotonic() - began < timeout_s
-        time.sleep(0.01)
-    return time.monotonic() - began

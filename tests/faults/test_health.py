@@ -7,11 +7,8 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,14 +18,10 @@ from protocols.bus.router.zenoh_router import free_endpoint
 from protocols.session.calibration import read_calibration
 from tests.faults.matrix import measured
 from tests.faults.processes import Process, wait_until
+from tests.support.receiving import http_get
 
 CAMERAS = ("cam0", "cam1", "cam2")
 LIMIT_S = 5.0
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
 
 
 class Site:
@@ -36,7 +29,7 @@ class Site:
 
     def __init__(self, folder: Path, disk: Path) -> None:
         self.folder, self.endpoint = folder, free_endpoint()
-        self.ports = {name: _free_port() for name in ("router", "recorder", "hub", *CAMERAS)}
+        self.ports = {name: int(free_endpoint().rpartition(":")[2]) for name in ("router", "recorder", "hub", *CAMERAS)}
         self.processes: dict[str, Process] = {}
         self._own = {
             "router": "",
@@ -68,13 +61,7 @@ class Site:
         os.kill(self.processes[name].child.pid, number)
 
     def ready(self, name: str) -> tuple[int, str]:
-        try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{self.ports[name]}/readyz", timeout=2.0) as answer:
-                return answer.status, answer.read().decode()
-        except urllib.error.HTTPError as error:
-            return error.code, error.read().decode()
-        except OSError as error:
-            return 0, str(error)
+        return http_get(f"127.0.0.1:{self.ports[name]}", "readyz")
 
     def all_ready(self, *names: str) -> bool:
         return all(self.ready(name)[0] == 200 for name in names or self.ports)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from protocols.bus.transport.zenoh_bus import ZenohBus, open_bus
 from protocols.topics import OBSERVATION, STATUS
 from tests.faults.matrix import measured
 from tests.faults.processes import Process, wait_until
-from tests.support.receiving import collect, matched, sequences
+from tests.support.receiving import collect, http_get, matched, sequences
 from tests.support.samples import observation
 
 
@@ -107,16 +106,7 @@ def test_every_refusal_is_a_counter_on_metrics_and_in_the_status(tmp_path: Path)
         f'out = "log.mcap"\n[bus]\nmode = "client"\nconnect = ["{endpoint}"]\n[health]\nlisten = "127.0.0.1:{port}"\n',
         encoding="utf-8",
     )
-
-    def get(path: str) -> tuple[int, str]:
-        try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/{path}", timeout=2.0) as answer:
-                return answer.status, answer.read().decode()
-        except urllib.error.HTTPError as error:
-            return error.code, error.read().decode()
-        except OSError:
-            return 0, ""
-
+    get = partial(http_get, f"127.0.0.1:{port}")
     client = BusConfig(mode="client", connect=(endpoint,))
     with Router(endpoint), open_bus("local", client, timeout_s=5.0) as bus:
         with Process("-m", "deploy", "record", str(config), stderr=errors):

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
-import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,7 +18,8 @@ from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.errors import InputError
 from protocols.topics import OBSERVATION
 from tests.faults.matrix import measured
-from tests.faults.processes import Process, publisher, receiver, router, wait_until
+from tests.faults.processes import Process, flow, publisher, receiver, router, wait_until
+from tests.support.links import poisoned, through_a_link
 from tests.support.receiving import collect, matched
 from tests.support.samples import observation
 
@@ -42,13 +40,8 @@ def flowing_again(receiving: Process, after: float, timeout_s: float = 20.0) -> 
 
 
 def test_a_router_that_is_killed_is_missed_for_half_a_second(tmp_path: Path) -> None:
-    endpoint = free_endpoint()
     with ExitStack() as stack:
-        first = stack.enter_context(router(tmp_path, endpoint))
-        receiving = stack.enter_context(receiver(endpoint))
-        receiving.ready()
-        sending = stack.enter_context(publisher(endpoint))
-        assert sending.ready()["ready"]
+        endpoint, first, receiving, sending = stack.enter_context(flow(tmp_path))
         flows = []
         for _ in range(3):
             time.sleep(1.0)
@@ -73,13 +66,8 @@ def test_a_router_that_is_killed_is_missed_for_half_a_second(tmp_path: Path) -> 
 
 def test_a_hub_that_is_killed_finds_everything_again(tmp_path: Path) -> None:
     """The receiver, started anew, gets what it missed from the cameras' caches; each observation once."""
-    endpoint = free_endpoint()
     with ExitStack() as stack:
-        stack.enter_context(router(tmp_path, endpoint))
-        first = stack.enter_context(receiver(endpoint))
-        first.ready()
-        sending = stack.enter_context(publisher(endpoint))
-        assert sending.ready()["ready"]
+        endpoint, _, first, sending = stack.enter_context(flow(tmp_path))
         time.sleep(3.0)
         os.kill(first.child.pid, signal.SIGKILL)
         first.child.wait()
@@ -125,37 +113,11 @@ def test_an_agent_that_is_killed_or_frozen_is_seen(tmp_path: Path, number: signa
     assert max(times) < 5.0
 
 
-def poisoning_proxy(target: str) -> str:
-    """A link that turns a harmless key into one with a `?`, as a broken or hostile client would declare it."""
-    host, _, port = target.removeprefix("tcp/").rpartition(":")
-    listening = socket.create_server(("127.0.0.1", 0))
-
-    def pump(source: socket.socket, sink: socket.socket, change: Callable[[bytes], bytes]) -> None:
-        with suppress(OSError):
-            while data := source.recv(65_536):
-                sink.sendall(change(data))
-
-    def serve() -> None:
-        client, _ = listening.accept()
-        there = socket.create_connection((host, int(port)))
-        threading.Thread(target=pump, args=(client, there, lambda d: d.replace(b"camQ", b"cam?")), daemon=True).start()
-        pump(there, client, lambda data: data)
-
-    threading.Thread(target=serve, daemon=True).start()
-    return f"tcp/127.0.0.1:{listening.getsockname()[1]}"
-
-
 def test_a_router_that_lives_but_does_not_route_starts_itself_anew(tmp_path: Path) -> None:
     """One declaration with a `?` in its key ends all routing of Zenoh 1.10.2, while the process stays alive."""
-    endpoint = free_endpoint()
-    with ExitStack() as stack:
-        routing = stack.enter_context(router(tmp_path, endpoint))
-        receiving = stack.enter_context(receiver(endpoint))
-        receiving.ready()
-        sending = stack.enter_context(publisher(endpoint))
-        assert sending.ready()["ready"]
+    with flow(tmp_path) as (endpoint, routing, receiving, sending):
         time.sleep(2.0)
-        poison = open_session(BusConfig(mode="client", connect=(poisoning_proxy(endpoint),)), timeout_s=5.0)
+        poison = open_session(BusConfig(mode="client", connect=(through_a_link(endpoint, poisoned),)), timeout_s=5.0)
         began = time.monotonic()
         poison.declare_publisher("camQ/observation")
         wait_until(lambda: "nothing has passed" in (tmp_path / "router.txt").read_text(encoding="utf-8"))

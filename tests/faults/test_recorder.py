@@ -13,10 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from protocols.bus.router.zenoh_router import free_endpoint
 from protocols.log.read.reader import LogReader
 from tests.faults.matrix import measured
-from tests.faults.processes import Process, publisher, receiver, router, wait_until
+from tests.faults.processes import Process, flow, wait_until
 
 
 @pytest.fixture
@@ -42,13 +41,9 @@ def config(folder: Path, out: Path, endpoint: str) -> Path:
 
 
 def test_a_recorder_on_a_full_disk_waits_and_goes_on_when_there_is_space(tmp_path: Path, small_disk: Path) -> None:
-    endpoint, logs = free_endpoint(), small_disk / "logs"
+    logs = small_disk / "logs"
     with ExitStack() as stack:
-        stack.enter_context(router(tmp_path, endpoint))
-        hub = stack.enter_context(receiver(endpoint))
-        hub.ready()
-        sending = stack.enter_context(publisher(endpoint))
-        sending.ready()
+        endpoint, _, hub, sending = stack.enter_context(flow(tmp_path))
         errors = tmp_path / "recorder.txt"
         words = ("-m", "deploy", "record", str(config(tmp_path, logs, endpoint)))
         recording = stack.enter_context(Process(*words, stderr=errors))
@@ -90,13 +85,9 @@ def test_a_recorder_on_a_full_disk_waits_and_goes_on_when_there_is_space(tmp_pat
 
 
 def test_a_recorder_that_is_killed_leaves_a_log_that_can_be_read(tmp_path: Path) -> None:
-    endpoint, log = free_endpoint(), tmp_path / "log.mcap"
+    log = tmp_path / "log.mcap"
     with ExitStack() as stack:
-        stack.enter_context(router(tmp_path, endpoint))
-        hub = stack.enter_context(receiver(endpoint))
-        hub.ready()
-        sending = stack.enter_context(publisher(endpoint))
-        sending.ready()
+        endpoint, _, hub, sending = stack.enter_context(flow(tmp_path))
         recording = stack.enter_context(Process("-m", "deploy", "record", str(config(tmp_path, log, endpoint))))
         wait_until(log.exists)
         time.sleep(3.0)

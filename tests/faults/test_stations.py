@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -20,20 +19,16 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("pymavlink")
+from deploy.agents.processes import free_udp_port
 from edge.mavlink.dialect import mavlink as M
 from edge.mavlink.link.transport import Udp, Url
 from edge.mavlink.roles.camera import SelectTarget
+from protocols.bus.router.zenoh_router import free_endpoint
 from tests.faults.stations import STATIONS, exchanged
 from tests.support.vehicle_link import autopilot, camera_on
 
 SERVERS = {"MAVSDK 3": "mavsdk", "MAVSDK 4": "mavsdk_grpc"}
 MAVPROXY = STATIONS / "bin" / "mavproxy.py"
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @contextmanager
@@ -106,7 +101,7 @@ def test_an_application_with_mavsdk_finds_the_camera_and_selects(
     if not server.exists():
         pytest.skip(f"NO {client} HERE: `make faults` installs it")
     monkeypatch.syspath_prepend(str(STATIONS))
-    port = free_port(socket.SOCK_STREAM)
+    port = int(free_endpoint().rpartition(":")[2])
     with (
         autopilot() as (_, mavlink_port),
         camera_on(f"udpout:127.0.0.1:{mavlink_port}") as camera,
@@ -149,7 +144,7 @@ def hears_camera(port: int, patience_s: float) -> bool:
 @pytest.mark.skipif(not MAVPROXY.exists(), reason="NO MAVPROXY HERE: `make faults` installs it")
 @pytest.mark.parametrize("camera_at", ["autopilot", "second output"])
 def test_behind_mavproxy_the_camera_is_seen_only_if_it_is_on_the_autopilot(tmp_path: Path, camera_at: str) -> None:
-    for_station, for_camera = free_port(), free_port()
+    for_station, for_camera = free_udp_port(), free_udp_port()
     routed = camera_at == "autopilot"
     with autopilot() as (_, port):
         proxy = [sys.executable, str(MAVPROXY), "--daemon", "--no-state", "--mav20", "--default-modules="]

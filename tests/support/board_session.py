@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edge.scenes.common.placement import look_at_pose
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
@@ -29,6 +30,14 @@ class BoardCamera:
     fps: float
 
 
+def rig_cameras(cameras: dict[str, BoardCamera], lenses: bool) -> dict[str, RigCamera]:
+    """The cameras of a rig, with or without their lenses."""
+    return {
+        name: RigCamera(name, (one.lens.width, one.lens.height), one.fps, one.lens if lenses else None)
+        for name, one in cameras.items()
+    }
+
+
 @dataclass(frozen=True)
 class BoardWorld:
     """Cameras on an arc around a board that is moved and turned by hand. points: of the board [m], by label."""
@@ -46,11 +55,10 @@ class BoardWorld:
 
     def rig(self, lenses: bool = True, scale: float = 1.0) -> Rig:
         """The rig, with or without its lenses; the board's points times ``scale``."""
-        cameras = {
-            name: RigCamera(name, (one.lens.width, one.lens.height), one.fps, one.lens if lenses else None)
-            for name, one in self.cameras.items()
-        }
-        return Rig(cameras, bodies={"board": {label: scale * point for label, point in self.points.items()}})
+        return Rig(
+            rig_cameras(self.cameras, lenses),
+            bodies={"board": {label: scale * point for label, point in self.points.items()}},
+        )
 
     def views(
         self, seconds: float, seed: int, jitter: float = 0.0, readout: float = 0.0
@@ -120,7 +128,7 @@ def board_world(
         lens = Intrinsics(1280, 720, matrix, np.array([rng.uniform(-0.3, 0.15), rng.uniform(-0.1, 0.1), 0, 0, 0]))
         clock = 0.0 if i == 0 else rng.uniform(-lag, lag)
         drift = 1.0 if i == 0 else 1.0 + rng.normal(0, 3e-5)
-        cameras[f"cam{i}"] = BoardCamera(lens, looking_at(place, target + rng.normal(0, 0.04, 3)), clock, drift, rate)
+        cameras[f"cam{i}"] = BoardCamera(lens, look_at_pose(place, target + rng.normal(0, 0.04, 3)), clock, drift, rate)
     frequency = rng.uniform(0.1, 0.7, (6, 3))
     amplitude = rng.normal(0, 1, (6, 3)) * np.minimum(1.0, 0.35 / frequency) / np.sqrt(3)
     amplitude[:3] *= 0.22
@@ -161,11 +169,3 @@ def render_videos(
             image = renderer.draw(drawing, rotation, centre) if faces else renderer.draw(drawing, rotation, 50 * centre)
             images.append(255 - image if inverted else image)
         write_video(folder / f"{name}.mp4", images, times)
-
-
-def looking_at(place: Floats, target: Floats) -> Pose:
-    """The pose of an upright camera at ``place`` (3,) that looks at ``target`` (3,)."""
-    ahead = (target - place) / np.linalg.norm(target - place)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return Pose(np.stack([right, np.cross(ahead, right), ahead]), place)

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
+from edge.scenes.common.placement import look_at_pose
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
-from tests.support.rigs import looking_at
 
 HEIGHT = 1.75
 SIZE = (960, 720)
@@ -28,7 +28,8 @@ def lens() -> Intrinsics:
 def poses() -> dict[str, Pose]:
     """Three cameras around a square of 6 m, at 3 m."""
     return {
-        name: looking_at(np.array(stand), np.array([0.0, 0.0, 0.8])) for name, stand in zip(NAMES, _STANDS, strict=True)
+        name: look_at_pose(np.array(stand), np.array([0.0, 0.0, 0.8]))
+        for name, stand in zip(NAMES, _STANDS, strict=True)
     }
 
 

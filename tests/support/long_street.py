@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from edge.scenes.common.placement import look_at_pose
 from hub.clocks.external_prior import ExternalClockPrior
 from protocols.core.clocks import TimeMap
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
-from tests.support.rigs import SIZE, looking_at, random_lens
+from tests.support.rigs import SIZE, random_lens
 
 _SPACING_M, _REACH_M, _STRETCH_M = 2.0, 12.0, 20.0
 """Between two masts, alternately on both sides; how far along the street one sees; what one target is at home in."""
@@ -48,7 +49,7 @@ def street(
     for number in range(cameras):
         name, place = f"cam{number}", _SPACING_M * number
         at = np.array([place, (-1) ** number * rng.uniform(9.0, 12.0), rng.uniform(3.0, 5.0)])
-        poses[name] = looking_at(at, np.array([place + rng.uniform(-3, 3), 0.0, 1.5]))
+        poses[name] = look_at_pose(at, np.array([place + rng.uniform(-3, 3), 0.0, 1.5]))
         table[name] = RigCamera(name, SIZE, fps, replace(random_lens(rng), distortions=np.zeros(5)))
         rate, epoch = 1.0 + 1e-6 * rng.uniform(-50, 50), float(rng.uniform(0, 1e5))
         true = rng.uniform(0, 1 / fps) + np.arange(int(seconds * fps)) / fps

@@ -1,6 +1,9 @@
-"""Helpers of the tests that receive from a bus."""
+"""Helpers of the tests that receive from a bus, or over HTTP."""
 
 from __future__ import annotations
+
+import urllib.error
+import urllib.request
 
 from protocols.bus.base import Publisher, Received, Subscription
 from tests.support.samples import eventually
@@ -25,3 +28,14 @@ def sequences(received: list[Received]) -> list[int]:
 def matched(publisher: Publisher) -> Publisher:
     assert publisher.wait_matched(10.0), "nobody subscribed"
     return publisher
+
+
+def http_get(address: str, path: str) -> tuple[int, str]:
+    """Status and body of the answer of ``host:port``; 0 and the reason without one."""
+    try:
+        with urllib.request.urlopen(f"http://{address}/{path}", timeout=5.0) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+    except OSError as error:
+        return 0, str(error)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import pathlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from edge.scenes.common.placement import look_at_pose
+from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from protocols.core.clocks import CameraTime, ReferenceTime, TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
-from protocols.geometry.types import Floats, Ints
+from protocols.geometry.types import Bools, Floats, Ints
+from protocols.session.folder import write_observations
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
 
@@ -65,6 +69,65 @@ class Session:
             order=self.rig.cameras,
         )
 
+    def where(self, keep: Bools) -> Session:
+        """The session with the rows (n,) to keep only."""
+        at = np.flatnonzero(keep)
+        return replace(
+            self,
+            camera=[self.camera[i] for i in at],
+            label=[self.label[i] for i in at],
+            frame=self.frame[at],
+            time=self.time[at],
+            pixels=self.pixels[at],
+        )
+
+    def of_camera(self, name: str) -> Bools:
+        """(n,) the rows of a camera."""
+        return np.array([camera == name for camera in self.camera])
+
+    @property
+    def true(self) -> Floats:
+        """(n,) true times of the rows."""
+        return np.array([self.true_time(name, float(t)) for name, t in zip(self.camera, self.time, strict=True)])
+
+    def moved(self, name: str, since: float, pose: Pose) -> Session:
+        """The session with a camera at another pose from a true time on; each row keeps its noise."""
+        rows, lens, pixels = self.of_camera(name) & (self.true > since), self.lens(name), self.pixels.copy()
+        points = self.paths[DEFAULT_LABEL].at(self.true[rows])
+        pixels[rows] += lens.project(pose.camera_from_world(points))
+        pixels[rows] -= lens.project(self.poses[name].camera_from_world(points))
+        return replace(self, pixels=pixels, poses={**self.poses, name: pose})
+
+    def turned(self, name: str, since: float, angle: float) -> Session:
+        """The session with a camera turned by an angle [rad] about its vertical axis from a true time on."""
+        pose = self.poses[name]
+        return self.moved(name, since, replace(pose, rotation=so3.exp(np.array([0.0, angle, 0.0])) @ pose.rotation))
+
+    def lens(self, name: str) -> Intrinsics:
+        """The intrinsics of a camera that has some."""
+        found = self.rig.cameras[name].intrinsics
+        assert found is not None
+        return found
+
+    def smoothed(self, name: str) -> dict[str, SmoothTrack]:
+        """A camera's tracks by label, all with one time origin."""
+        own, lens = self.observations().of_camera(name), self.lens(name)
+        begin = min(float(track.time[0]) for track in own)
+        found = {t.label: smooth_track(t.time, lens.unproject(t.pixels), lens.focal, begin) for t in own}
+        return {label: track for label, track in found.items() if track is not None}
+
+    def without_lenses(self, *names: str) -> Session:
+        """The session without the intrinsics of ``names``, or of all; their distortion stays in the pixels."""
+        cameras = {
+            name: replace(camera, intrinsics=None) if name in names or not names else camera
+            for name, camera in self.rig.cameras.items()
+        }
+        return replace(self, rig=replace(self.rig, cameras=cameras))
+
+    def write(self, folder: pathlib.Path, metadata: str = "") -> pathlib.Path:
+        """The session as a new folder. metadata: lines of that table."""
+        return write_session(folder, self.rig, self.observations(), metadata)
+
     def csv(self) -> str:
         """The rows as observations.csv."""
         lines = ["camera,frame,time,u,v,label"]
@@ -106,21 +169,25 @@ class Session:
         return max(errors)
 
 
+def write_session(folder: pathlib.Path, rig: Rig, observations: Observations, metadata: str = "") -> pathlib.Path:
+    """Cameras and rows as a new folder. metadata: lines of that table."""
+    folder.mkdir()
+    text = f"[metadata]\n{metadata}\n" if metadata else ""
+    for name, camera in rig.cameras.items():
+        text += f'[{name}]\nname = "{name}"\nsize = {list(camera.size)}\nfps = {camera.fps}\n'
+        if (lens := camera.intrinsics) is not None:
+            text += f"matrix = {lens.matrix.tolist()}\ndistortions = {lens.distortions.tolist()}\n"
+    (folder / "rig.toml").write_text(text)
+    write_observations(folder / "observations.csv", observations)
+    return folder
+
+
 def random_path(rng: np.random.Generator, fastest: float = 0.7, extent: float = 1.0) -> Path:
     """A band-limited path within about ±extent metres, nothing faster than ``fastest`` Hz."""
     frequency = rng.uniform(0.05, fastest, (5, 3))
     amplitude = rng.uniform(0.4, 1.0, (5, 3)) / np.maximum(1.0, frequency / 0.3)
     amplitude *= extent / amplitude.sum(axis=0) * 1.4
     return Path(frequency, rng.uniform(0, 2 * np.pi, (5, 3)), amplitude)
-
-
-def looking_at(position: Floats, target: Floats, roll: float = 0.0) -> Pose:
-    """A camera at ``position`` whose axis goes through ``target``; world z up."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Pose(so3.exp(np.array([0.0, 0.0, roll])) @ rotation, position)
 
 
 def random_lens(rng: np.random.Generator, fisheye: bool = False) -> Intrinsics:
@@ -140,7 +207,7 @@ def random_poses(rng: np.random.Generator, count: int) -> list[Pose]:
     azimuth = np.deg2rad(np.cumsum(steps)) + rng.uniform(0, 2 * np.pi)
     radius, height = rng.uniform(4.0, 6.0, count), rng.uniform(-0.5, 2.5, count)
     places = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
-    return [looking_at(place, rng.normal(0, 0.15, 3), rng.normal(0, 0.1)) for place in places]
+    return [look_at_pose(place, rng.normal(0, 0.15, 3), rng.normal(0, 0.1)) for place in places]
 
 
 def simulate(

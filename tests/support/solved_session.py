@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from edge.scenes.common.placement import look_at_pose
 from protocols.core.clocks import TimeMap
 from protocols.core.pair_report import PairReport
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
 
 REFUSED = "could not be connected to any camera (with cam0: the point hardly moves)"
-
-
-def looking_at(position: Floats, target: Floats) -> Pose:
-    """A level camera at a position, looking at a point; z is up."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return Pose(np.stack([right, np.cross(forward, right), forward]), position)
 
 
 def solved_session(
@@ -42,7 +34,7 @@ def solved_session(
     observed_rows: list[tuple[str, int, float, Floats]] = []
     for number, name in enumerate(names):
         place = np.array([5 * np.cos(azimuth[number]), 5 * np.sin(azimuth[number]), 1.8])
-        pose = looking_at(place, np.array([0.0, 0.0, 1.0]))
+        pose = look_at_pose(place, np.array([0.0, 0.0, 1.0]))
         clock = TimeMap(1.0 + 1e-5 * number, 3.25 * number)
         seen = clock_times(clock, time)
         error = random.normal(0.0, noise_px, (rows, 2))

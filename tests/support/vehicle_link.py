@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,27 +20,10 @@ from edge.mavlink.roles.camera import CameraComponent, OperatorCommand, SelectTa
 from edge.mavlink.roles.camera_messages import VideoStream
 from edge.mavlink.roles.vehicle import Vehicle
 from protocols.geometry.camera import Intrinsics
+from tests.support.threads import looping
 
 LENS = Intrinsics(640, 480, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]))
 URI = "rtsp://127.0.0.1:8554/overlay"
-
-
-@contextmanager
-def looping(step: Callable[[], object], pause_s: float = 0.005) -> Iterator[None]:
-    """Call ``step`` in a thread until the end."""
-    stop = threading.Event()
-
-    def run() -> None:
-        while not stop.wait(pause_s):
-            step()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 @contextmanager

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edge.scenes.common.placement import look_at_pose
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations, gather_tracks
-from protocols.session.rig import Rig, RigCamera
-from tests.support.board_session import BoardCamera, board_world, looking_at
+from protocols.session.rig import Rig
+from tests.support.board_session import BoardCamera, board_world, rig_cameras
 
 JOINTS = (
     "nose", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
@@ -41,12 +42,7 @@ class PeopleWorld:
 
     def rig(self, lenses: bool = True) -> Rig:
         """The rig with independent clocks."""
-        return Rig(
-            {
-                name: RigCamera(name, (one.lens.width, one.lens.height), one.fps, one.lens if lenses else None)
-                for name, one in self.cameras.items()
-            }
-        )
+        return Rig(rig_cameras(self.cameras, lenses))
 
     def observations(
         self, seconds: float, *, noise: float = 2.0, seed: int = 0, renumbered_every: float = 5.0, missed: float = 0.05
@@ -82,7 +78,7 @@ def people_world(seed: int, people: int = 3, fps: tuple[float, ...] = (25.0, 30.
     for number, (name, one) in enumerate(board_world(seed, fps).cameras.items()):
         angle = 2.4 * number / len(fps) + rng.uniform(-0.15, 0.15)
         place = rng.uniform(4.5, 6.0) * np.array([np.cos(angle), np.sin(angle), 0.0]) + [0, 0, rng.uniform(1.0, 2.8)]
-        cameras[name] = BoardCamera(one.lens, looking_at(place, np.array([0, 0, 0.9])), one.offset, one.rate, one.fps)
+        cameras[name] = BoardCamera(one.lens, look_at_pose(place, np.array([0, 0, 0.9])), one.offset, one.rate, one.fps)
     frequency = rng.uniform(0.03, 0.16, (people, 2, 3))
     amplitude = rng.uniform(0.5, 1.0, (people, 2, 3)) * np.minimum(1.0, 0.1 / frequency)
     path = amplitude, frequency, rng.uniform(0, 2 * np.pi, (people, 2, 3))

@@ -19,7 +19,7 @@ def write_calibration(file: Path, calibration: Calibration, rig: Rig) -> None:
 
 def write_trajectory(file: Path, calibration: Calibration) -> None:
     """Write trajectory.csv."""
-    write_atomically(file, trajectory_text(calibration))
+    write_atomically(file, trajectory_text(calibration.trajectories, len(calibration.trajectories) > 1))
 
 
 def write_result(file: Path, document: dict[str, Any]) -> None:

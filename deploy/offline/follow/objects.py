@@ -18,12 +18,12 @@ from typing import Literal
 
 import numpy as np
 
-from deploy.offline.csv_table import CsvTable, read_csv_header, read_csv_table
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
+from protocols.session.csv_table import CsvTable, read_csv_header, read_csv_table
 from protocols.session.detections import DetectionRows, read_detections
 from protocols.validation.codec import SCHEMA_VERSION
 
@@ -65,7 +65,7 @@ def read_objects(file: Path, sizes: Mapping[str, tuple[int, int]]) -> DetectionR
     """
     boxes = is_boxes_file(file)
     table = read_csv_table(file, "observations", _BOX_COLUMNS if boxes else ("camera", "time"))
-    names = table.columns["camera"]
+    names = table.text("camera")
     table.refuse(
         np.array([name not in sizes for name in names]),
         lambda row: f"camera {names[row][:63]!r} is not in the calibration ({', '.join(sizes)})",
@@ -96,7 +96,7 @@ def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> Detectio
     box = np.column_stack([table.numbers(name, MAX_PIXEL) for name in ("x", "y", "width", "height")])
     for side, wrong in ((3, "its foot is not below its head"), (2, "its right side is not right of its left")):
         table.refuse(box[:, side] <= 0.0, partial(_flat, box, wrong))
-    limit = np.array([sizes[name] for name in table.columns["camera"]], dtype=np.float64)
+    limit = np.array([sizes[name] for name in table.text("camera")], dtype=np.float64)
     table.refuse(
         np.full(len(box), bool((box <= 1.0).all())),
         lambda row: "all boxes are within 0 to 1: fractions of the picture",
@@ -119,7 +119,7 @@ def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> Detectio
     count = len(table)
     nothing = np.full((count, 4), np.nan)
     return DetectionRows(
-        camera=table.columns["camera"],
+        camera=table.text("camera"),
         label=[""] * count,
         kind=[""] * count,
         frame=table.whole("frame"),

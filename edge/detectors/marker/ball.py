@@ -70,9 +70,7 @@ class MarkerModel:
         return cls(ColourModel.from_table(table), str(table.get("label", "marker")))
 
 
-def learn_marker_model(
-    image: npt.NDArray[np.uint8], box: tuple[float, float, float, float], label: str = "marker"
-) -> MarkerModel:
+def learn_marker_model(image: npt.NDArray[np.uint8], box: tuple[float, float, float, float]) -> MarkerModel:
     """Learn a model from one image and a box around the marker in it.
 
     image: (H, W, 3) BGR. box: x, y (top left), width, height [px]; it may include some background. Pixels inside are
@@ -93,7 +91,7 @@ def learn_marker_model(
         return np.asarray(across & (np.abs(rows - (y + 0.5 * h - 0.5)) < 0.5 * h + grow))
 
     # A gap between inside and outside, because boxes are drawn inaccurately.
-    return MarkerModel(learn_colour_model(image, within(0.0), ~within(2.0 + 0.1 * max(w, h))), label)
+    return MarkerModel(learn_colour_model(image, within(0.0), ~within(2.0 + 0.1 * max(w, h))), "marker")
 
 
 class MarkerDetector:

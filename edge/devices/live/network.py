@@ -32,12 +32,11 @@ def open_network(
     fps: float | None = None,
     intrinsics: Intrinsics | None = None,
     is_installed: Callable[[str], bool] = lambda name: find_spec(name) is not None,
-    now_ns: Callable[[], int] = time.monotonic_ns,
 ) -> Device:
     """The device for a stream, not yet open: through PyAV, or through OpenCV, which stamps on arrival."""
     if is_installed("av"):
-        return NetworkCamera(url, transport=transport, fps=fps, intrinsics=intrinsics, now_ns=now_ns)
-    return OpenCvCamera(url, fps=fps, intrinsics=intrinsics, driver="rtsp", now_ns=now_ns)
+        return NetworkCamera(url, transport=transport, fps=fps, intrinsics=intrinsics)
+    return OpenCvCamera(url, fps=fps, intrinsics=intrinsics, driver="rtsp")
 
 
 class NetworkCamera(ReconnectingCamera):

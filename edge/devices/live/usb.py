@@ -42,14 +42,13 @@ def open_usb(
     *,
     intrinsics: Intrinsics | None = None,
     is_installed: Callable[[str], bool] = lambda name: find_spec(name) is not None,
-    now_ns: Callable[[], int] = time.monotonic_ns,
 ) -> Device:
     """The device for a USB camera, not yet open: through linuxpy, or through OpenCV, which stamps on arrival."""
     if settings.device.isdecimal():
         settings = msgspec.structs.replace(settings, device=f"/dev/video{settings.device}")
     if is_installed("linuxpy"):
-        return UsbCamera(settings, intrinsics=intrinsics, now_ns=now_ns)
-    return OpenCvCamera(settings.device, fps=settings.fps, intrinsics=intrinsics, driver="usb", now_ns=now_ns)
+        return UsbCamera(settings, intrinsics=intrinsics)
+    return OpenCvCamera(settings.device, fps=settings.fps, intrinsics=intrinsics, driver="usb")
 
 
 class UsbCamera(ReconnectingCamera):

@@ -43,7 +43,7 @@ def place_cameras(
     return tuple(_camera(rng, index, float(azimuth[index]), centre, surroundings) for index in range(count))
 
 
-def look_at_pose(position: Floats, target: Floats, roll: float) -> Pose:
+def look_at_pose(position: Floats, target: Floats, roll: float = 0.0) -> Pose:
     """Pose of a camera at ``position`` (3,) looking at ``target`` (3,), rolled by ``roll`` [rad] about its axis."""
     forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross(forward, [0.0, 0.0, 1.0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,7 +25,6 @@ _CAMERAS = CameraPlacement(
     fps=(10.0,),
     roll=0.06,
 )
-_MIXED = (10.0, 12.5, 9.99, 15.0)  # Hz: as cheap network cameras
 _STREAMS = {"cameras": 0, "people": 1}  # the background has stream 2
 RADII = {"head": 0.062, "neck": 0.032, "torso": 0.085, "pelvis": 0.075, "arm": 0.028, "thigh": 0.05, "shank": 0.036}
 """Radii of the parts of a body, over its height."""
@@ -130,12 +129,11 @@ _TROUSERS = ((92, 60, 44), (42, 42, 46), (118, 138, 150), (70, 84, 96), (140, 10
 _SHOES = ((40, 42, 48), (205, 206, 210), (50, 70, 110))  # BGR
 
 
-def people_room(seed: int, cameras: int, people: int, mixed_fps: bool = False) -> PeopleScene:
+def people_room(seed: int, cameras: int, people: int) -> PeopleScene:
     """The scene ``people`` of a seed; see ``edge.scenes.get_people_scene``."""
     rng = np.random.default_rng([seed, _STREAMS["people"]])
-    placement = replace(_CAMERAS, fps=_MIXED) if mixed_fps else _CAMERAS
     centre = np.array([0.0, 0.0, 0.9])
-    placed_cameras = place_cameras(np.random.default_rng([seed, _STREAMS["cameras"]]), centre, cameras, placement)
+    placed_cameras = place_cameras(np.random.default_rng([seed, _STREAMS["cameras"]]), centre, cameras, _CAMERAS)
     tops = rng.permutation(len(_TOPS))
     persons = tuple(
         Person(

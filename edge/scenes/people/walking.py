@@ -17,7 +17,7 @@ JOINTS = (
     "hip_l", "knee_l", "ankle_l", "toe_l", "hip_r", "knee_r", "ankle_r", "toe_r",
 )  # fmt: skip
 CROWN = JOINTS.index("crown")
-_STEP_S = 0.2  # of the stored path
+_STEP_S, _LENGTH_S = 0.2, 240.0  # of the stored path
 _TURN_S = 1.2  # duration of the turn at an end of the path
 _STRIDE = 0.82  # length of two steps over the body's height
 
@@ -79,7 +79,7 @@ def _spline(values: Floats, time: Floats) -> Floats:
     return np.asarray(sum(weight * values[first + k] for k, weight in enumerate(weights)))
 
 
-def random_walks(rng: np.random.Generator, people: int, half: float, length_s: float = 240.0) -> WalkingPaths:
+def random_walks(rng: np.random.Generator, people: int, half: float) -> WalkingPaths:
     """Paths of people who walk between random goals within ±half [m], at 0.9 to 1.4 m/s, by a social-force model."""
     step = 0.05
     speed = rng.uniform(0.9, 1.4, people)
@@ -90,7 +90,7 @@ def random_walks(rng: np.random.Generator, people: int, half: float, length_s: f
     rest = np.zeros(people)
     kept = []
     every = round(_STEP_S / step)
-    for index in range(round(length_s / step) + 4 * every):
+    for index in range(round(_LENGTH_S / step) + 4 * every):
         if index % every == 0:
             kept.append(place.copy())
         towards = goal - place

@@ -8,6 +8,7 @@ import numpy as np
 from hub.distributed.factors.two_view_model import LinearisedObservations, RelativeTransform, linearise_observations
 from hub.two_view.relative_pose import decompose_essential
 from protocols.geometry import so3
+from protocols.geometry.pose import fit_similarity
 from protocols.geometry.types import Bools, Floats
 
 MIN_SIZED_OBSERVATIONS = 12
@@ -168,12 +169,8 @@ def resect(
 
 def procrustes(points_k: Floats, points_l: Floats, weights: Floats | None = None) -> RelativeTransform:
     """Procrustes: the rigid motion from points in k's axes (n, 3) to l's (distributed pose paper, eqs. 15 to 19)."""
-    w = np.ones(len(points_k)) if weights is None else weights
-    w = w / w.sum()
-    mean_k, mean_l = w @ points_k, w @ points_l
-    u, _, vt = np.linalg.svd((w[:, None] * (points_l - mean_l)).T @ (points_k - mean_k))
-    rotation = (u * np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])) @ vt
-    return RelativeTransform(rotation, mean_k - rotation.T @ mean_l)
+    fit = fit_similarity(points_k, points_l, weights=weights, scale=False)
+    return RelativeTransform(fit.rotation, -fit.rotation.T @ fit.shift)
 
 
 def _ransac_bearings(rows: Floats, weights: Floats, seed: int) -> list[RelativeTransform]:

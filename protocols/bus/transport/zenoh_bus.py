@@ -386,16 +386,14 @@ def open_bus(
     *,
     stop: Callable[[], bool] | None = None,
     timeout_s: float | None = None,
-    clock_ns: Callable[[], int] = time.time_ns,
 ) -> ZenohBus:
     """Connect to the others of ``site``.
 
     stop: called while a client waits for its router; True raises BusStopped.
     timeout_s: how long a client waits for its router before InputError; None waits for ever.
-    clock_ns: stamps arrivals (Unix, ns).
     Raises InputError, in one line, for a site or an endpoint that cannot be used.
     """
     check_identifier(site, "site")
     config = config or BusConfig()
     session = open_session(config, stop=stop, timeout_s=timeout_s)
-    return ZenohBus(session, site, clock_ns, config.outage_s, needs_router=config.mode == "client")
+    return ZenohBus(session, site, time.time_ns, config.outage_s, needs_router=config.mode == "client")

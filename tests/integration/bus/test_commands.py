@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from deploy.agents.recorder_commands import record_on_command, with_unused_log_path
@@ -17,6 +15,7 @@ from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CAMERA_INFO, COMMAND, OBSERVATION, STATUS
 from tests.support.samples import camera_info, eventually, observation
+from tests.support.threads import running
 
 
 def command(action: str, agent: str, agent_boot: str, sequence: int = 0) -> pb.Command:
@@ -59,17 +58,6 @@ class Site:
         self._sequence += 1
 
 
-@contextmanager
-def running(work: threading.Thread, stop: threading.Event) -> Iterator[None]:
-    work.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        work.join(20.0)
-        assert not work.is_alive()
-
-
 def test_an_order_is_obeyed_once_and_only_by_the_run_that_was_meant() -> None:
     with MemoryBus(MemoryHub()) as bus:
         orders = CommandSubscription(bus, "hub", "boot-2", ("recalibrate", "export"))
@@ -85,19 +73,19 @@ def test_an_order_is_obeyed_once_and_only_by_the_run_that_was_meant() -> None:
 
 
 def test_the_hub_forgets_when_asked_and_says_what_it_exported() -> None:
-    site, hub, stop = Site(), LiveHub(), threading.Event()
+    site, hub = Site(), LiveHub()
     exported: list[str] = []
 
     def export(asked: LiveHub) -> str:
         exported.append("now")
         return "exported to somewhere"
 
-    def work() -> None:
+    def work(stop: threading.Event) -> None:
         with MemoryBus(site.network) as bus:
             run_hub(hub, bus, "hub", stop, export=export)
 
     cameras = {name: site.bus.publisher(OBSERVATION, name) for name in ("cam0", "cam1")}
-    with running(threading.Thread(target=work), stop):
+    with running(work):
         assert eventually(lambda: site.status("hub") is not None)
         for name in cameras:
             site.bus.publisher(CAMERA_INFO, name).put(camera_info(name))
@@ -116,15 +104,15 @@ def test_the_hub_forgets_when_asked_and_says_what_it_exported() -> None:
 
 
 def test_a_recorder_stops_and_starts_and_every_log_is_whole(tmp_path: Path) -> None:
-    site, stop = Site(), threading.Event()
+    site = Site()
     config = RecorderConfig(out=tmp_path / "a.mcap", min_free_mb=0.0)
 
-    def work() -> None:
+    def work(stop: threading.Event) -> None:
         with MemoryBus(site.network) as bus:
             record_on_command(config, bus, stop)
 
     camera = site.bus.publisher(OBSERVATION, "cam0")
-    with running(threading.Thread(target=work), stop):
+    with running(work):
         assert eventually(lambda: site.status("recorder") is not None)
         camera.put(observation("cam0", 0))
         assert eventually(lambda: site.said("recorder", " messages"))

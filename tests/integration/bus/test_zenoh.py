@@ -7,6 +7,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 import zenoh
@@ -25,6 +27,15 @@ from tests.support.receiving import collect, matched, sequences
 from tests.support.samples import eventually, observation
 
 
+@contextmanager
+def connected() -> Iterator[tuple[Bus, Bus]]:
+    """Two buses through a router."""
+    endpoint = free_endpoint()
+    config = BusConfig(mode="client", connect=(endpoint,))
+    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+        yield sending, receiving
+
+
 def test_a_history_that_begins_in_the_middle_is_made_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """Zenoh 1.10.2 sometimes delivers a late joiner's history from the middle on, and counts no loss."""
     take = ZenohSubscription._take
@@ -34,9 +45,7 @@ def test_a_history_that_begins_in_the_middle_is_made_whole(monkeypatch: pytest.M
         return take(self, sample) if wanted else None
 
     monkeypatch.setattr(ZenohSubscription, "_take", from_the_middle)
-    endpoint = free_endpoint()
-    config = BusConfig(mode="client", connect=(endpoint,))
-    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+    with connected() as (sending, receiving):
         publishers = {camera: sending.publisher(OBSERVATION, camera) for camera in ("cam0", "cam1")}
         for index in range(100):
             for camera, publisher in publishers.items():
@@ -68,9 +77,7 @@ def test_a_gap_that_zenoh_gave_up_is_asked_for_until_the_cache_has_answered(monk
 
     monkeypatch.setattr(ZenohSubscription, "_take", with_a_gap)
     monkeypatch.setattr(ZenohSubscription, "_ask", broken_at_first)
-    endpoint = free_endpoint()
-    config = BusConfig(mode="client", connect=(endpoint,))
-    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+    with connected() as (sending, receiving):
         subscription = receiving.subscribe(OBSERVATION)
         publisher = matched(sending.publisher(OBSERVATION, "cam0"))
         for index in range(100):
@@ -91,9 +98,7 @@ def test_messages_are_taken_while_a_query_waits(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(ZenohSubscription, "_take", with_a_gap)
     monkeypatch.setattr(ZenohSubscription, "_ask", lambda self, question: freed.wait(20.0))
-    endpoint = free_endpoint()
-    config = BusConfig(mode="client", connect=(endpoint,))
-    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+    with connected() as (sending, receiving):
         subscription = receiving.subscribe(OBSERVATION)
         first, second = (matched(sending.publisher(OBSERVATION, f"cam{number}")) for number in range(2))
         for index in range(20):
@@ -119,9 +124,7 @@ def test_one_message_that_cannot_be_taken_costs_no_other(
         return take(self, sample)
 
     monkeypatch.setattr(ZenohSubscription, "_take", failing_once)
-    endpoint = free_endpoint()
-    config = BusConfig(mode="client", connect=(endpoint,))
-    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+    with connected() as (sending, receiving):
         subscription = receiving.subscribe(OBSERVATION)
         publisher = matched(sending.publisher(OBSERVATION, "cam0"))
         for index in range(20):
@@ -134,9 +137,8 @@ def test_one_message_that_cannot_be_taken_costs_no_other(
 def test_more_messages_than_the_channel_holds_arrive_while_nobody_drains() -> None:
     """And in order; a closed subscription leaves no thread behind, and what is queued can still be drained."""
     assert eventually(lambda: not [one for one in threading.enumerate() if one.name.startswith(("bus ", "recovery "))])
-    endpoint, threads = free_endpoint(), threading.active_count()
-    config = BusConfig(mode="client", connect=(endpoint,))
-    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+    threads = threading.active_count()
+    with connected() as (sending, receiving):
         subscription = receiving.subscribe(OBSERVATION)
         assert threading.active_count() == threads + 2, "one takes messages, one asks for lost ones"
         publisher = matched(sending.publisher(OBSERVATION, "cam0", rate_hz=1000.0, block=True))
@@ -153,9 +155,7 @@ def test_more_messages_than_the_channel_holds_arrive_while_nobody_drains() -> No
 
 def test_keys_that_messages_arrive_under_are_declared_once_and_forgotten() -> None:
     """Else Zenoh seeks the way of every message anew among all keys."""
-    endpoint = free_endpoint()
-    config = BusConfig(mode="client", connect=(endpoint,))
-    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+    with connected() as (sending, receiving):
         subscription = receiving.subscribe(OBSERVATION)
         for camera in ("cam0", "cam1"):
             publisher = matched(sending.publisher(OBSERVATION, camera))
@@ -171,9 +171,8 @@ def test_keys_that_messages_arrive_under_are_declared_once_and_forgotten() -> No
 
 def test_what_cannot_be_recovered_is_counted_exactly() -> None:
     """A flood far beyond the cache: every message is received, dropped by the queue, or counted as lost."""
-    endpoint, total = free_endpoint(), 20_000
-    config = BusConfig(mode="client", connect=(endpoint,))
-    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+    total = 20_000
+    with connected() as (sending, receiving):
         subscription = receiving.subscribe(OBSERVATION)
         publisher = matched(sending.publisher(OBSERVATION, "cam0"))
         for index in range(total):
@@ -192,9 +191,8 @@ def test_what_cannot_be_recovered_is_counted_exactly() -> None:
 
 def test_pictures_that_the_link_had_no_room_for_are_counted() -> None:
     """Of a topic of which the newest counts nothing is fetched again, but what never came is no secret."""
-    endpoint, data = free_endpoint(), b"\xff\xd8" + bytes(400_000) + b"\xff\xd9"
-    config = BusConfig(mode="client", connect=(endpoint,))
-    with Router(endpoint), open_bus("local", config) as sending, open_bus("local", config) as receiving:
+    data = b"\xff\xd8" + bytes(400_000) + b"\xff\xd9"
+    with connected() as (sending, receiving):
         subscription = receiving.subscribe(FLIGHT_IMAGE)
         publisher = matched(sending.publisher(FLIGHT_IMAGE, "drone"))
         image = pb.FlightImage(schema_version=1, agent="drone", boot_id="b", width=640, height=480, jpeg=data)

@@ -39,10 +39,13 @@ def test_the_notebook_tutorial_runs_from_top_to_bottom(
     assert "cam0" in capsys.readouterr().out
 
 
-def commands_of(page: str) -> list[list[str]]:
-    """The words of every command in a tutorial's blocks."""
+def run_commands_of(page: str) -> None:
+    """Run every command in a tutorial's blocks, three at most."""
     text = (DOCS / "tutorials" / page).read_text(encoding="utf-8")
-    return [shlex.split(line) for line in re.findall(r"^\$ syncline (.*)$", text, re.MULTILINE)]
+    commands = [shlex.split(line) for line in re.findall(r"^\$ syncline (.*)$", text, re.MULTILINE)]
+    assert 0 < len(commands) <= 3
+    for words in commands:
+        assert run(words) == 0
 
 
 def test_the_tutorial_on_boards_runs_as_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,10 +54,7 @@ def test_the_tutorial_on_boards_runs_as_written(tmp_path: Path, monkeypatch: pyt
     page = (DOCS / "tutorials" / "board.md").read_text(encoding="utf-8")
     (board,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (tmp_path / "videos" / "board.toml").write_text(board)
-    commands = commands_of("board.md")
-    assert 0 < len(commands) <= 3
-    for words in commands:
-        assert run(words) == 0
+    run_commands_of("board.md")
     rig, cameras = read_calibration(tmp_path / "out" / "calibration.toml")
     assert (rig.metadata["scale"], len(cameras)) == ("metric", 2)
 
@@ -80,10 +80,7 @@ def test_the_tutorial_on_keypoints_runs_as_written(tmp_path: Path, monkeypatch: 
         folder.mkdir(parents=True, exist_ok=True)
         document = {"people": [{"pose_keypoints_2d": np.ravel(values).tolist()}]}
         (folder / f"{name}_{frame:06d}.json").write_text(json.dumps(document))
-    commands = commands_of("keypoints.md")
-    assert 0 < len(commands) <= 3
-    for words in commands:
-        assert run(words) == 0
+    run_commands_of("keypoints.md")
     assert (tmp_path / "joints.trc").read_text().startswith("PathFileType")
 
 
@@ -91,8 +88,5 @@ def test_the_tutorial_on_two_phones_runs_as_written(tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)
     record_scene_videos(tmp_path / "videos", 6.0, 2, 4)
     (tmp_path / "videos" / "rig.toml").unlink(missing_ok=True)
-    commands = commands_of("two-phones.md")
-    assert 0 < len(commands) <= 3
-    for words in commands:
-        assert run(words) == 0
+    run_commands_of("two-phones.md")
     assert {"cam0.csv", "cam1.csv", "cam0.mp4"} <= {file.name for file in (tmp_path / "synced").iterdir()}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,8 @@ from protocols.geometry import so3
 from protocols.session.rig import RigCamera
 from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS
 from tests.support.clocks import AsFastAsPossible
+from tests.support.samples import eventually
+from tests.support.threads import running
 
 
 class ListedDevice:
@@ -60,13 +61,6 @@ class ScriptedDetector:
 
     def detect(self, image: np.ndarray, *_: object) -> list[Detection]:
         return self.answers.pop(0) if self.answers else []
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
 
 
 def messages(subscription: Any) -> list[Any]:
@@ -132,16 +126,11 @@ def test_it_is_announced_while_it_runs_and_stops_on_request() -> None:
     watch = MemoryBus(hub).watch_agents()
     observations = MemoryBus(hub).subscribe(OBSERVATION)
     device = ListedDevice([0, 1], endless=True)
-    stop = threading.Event()
     agent = CameraAgent(device, ScriptedDetector(), MemoryBus(hub), "cam0")
-    thread = threading.Thread(target=agent.run, args=(stop,))
-    thread.start()
-    assert observations.wait(5.0)
-    (event,) = watch.drain()
-    assert (event.role, event.agent, event.boot_id, event.alive) == ("camera", "cam0", agent.boot_id, True)
-    stop.set()
-    thread.join(5.0)
-    assert not thread.is_alive()
+    with running(agent.run):
+        assert observations.wait(5.0)
+        (event,) = watch.drain()
+        assert (event.role, event.agent, event.boot_id, event.alive) == ("camera", "cam0", agent.boot_id, True)
     assert [event.alive for event in watch.drain()] == [False]
     assert device.closed
 
@@ -151,14 +140,12 @@ def test_status_is_published_every_second_and_reports_missing_frames() -> None:
     statuses = MemoryBus(hub).subscribe(STATUS)
     clock = iter(range(0, 10**14, 10**8))  # each look at the clock is 0.1 s later
     device = ListedDevice([0], endless=True)
-    stop = threading.Event()
     agent = CameraAgent(device, ScriptedDetector(), MemoryBus(hub), "cam0", now_ns=lambda: next(clock))
-    thread = threading.Thread(target=agent.run, args=(stop,))
-    thread.start()
     collected: list[Any] = []
-    wait_for(lambda: bool(collected.extend(messages(statuses)) or any(m.state == "degraded" for m in collected)))
-    stop.set()
-    thread.join(5.0)
+    with running(agent.run):
+        assert eventually(
+            lambda: bool(collected.extend(messages(statuses)) or any(m.state == "degraded" for m in collected))
+        )
     assert collected[0].state == "running"
     silent = next(m for m in collected if m.state == "degraded")
     assert "no frame for" in silent.message
@@ -179,15 +166,11 @@ def test_a_hanging_bus_never_delays_the_capture(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(bus, "publisher", slow)
     device = ListedDevice(list(range(3000)), endless=True)
-    stop = threading.Event()
     agent = CameraAgent(device, ScriptedDetector(), bus, "cam0")
-    thread = threading.Thread(target=agent.run, args=(stop,))
-    thread.start()
-    wait_for(lambda: agent.frames == 3000)  # although no message has been published
-    observations = MemoryBus(hub).subscribe(OBSERVATION)
-    release.set()
-    stop.set()
-    thread.join(10.0)
+    with running(agent.run):
+        assert eventually(lambda: agent.frames == 3000)  # although no message has been published
+        observations = MemoryBus(hub).subscribe(OBSERVATION)
+        release.set()
     sequences = [m.sequence for m in messages(observations)]
     assert sequences == list(range(len(sequences)))
     assert 900 < len(sequences) < 1100  # the queue's capacity; the rest was dropped

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import pytest
 
@@ -16,6 +14,7 @@ from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS
 from tests.integration.live.test_live_hub import SETTINGS, feed, messages
 from tests.support.rigs import Path, Session, simulate
 from tests.support.samples import eventually
+from tests.support.threads import running
 
 UNIX_S = 1.7e9
 CONTRADICTION = "the images show a difference"
@@ -193,12 +192,10 @@ def test_the_hubs_status_reports_the_contradiction(hub: LiveHub, session: Sessio
 
 
 def test_a_running_hub_receives_priors_from_the_cameras_statuses(session: Session) -> None:
-    network, stop = MemoryHub(), threading.Event()
+    network = MemoryHub()
     with MemoryBus(network) as bus, MemoryBus(network) as own:
         statuses = bus.subscribe(STATUS)
-        worker = threading.Thread(target=run_hub, args=(LiveHub(SETTINGS), own, "hub", stop))
-        worker.start()
-        try:
+        with running(lambda stop: run_hub(LiveHub(SETTINGS), own, "hub", stop)):
             topics = {"CameraInfo": CAMERA_INFO, "Observation": OBSERVATION}
             publishers = {}
             for message in messages(session):
@@ -215,6 +212,3 @@ def test_a_running_hub_receives_priors_from_the_cameras_statuses(session: Sessio
                 return any(CONTRADICTION in text for text in messages_seen)
 
             assert eventually(reported, 60.0), messages_seen[-3:]
-        finally:
-            stop.set()
-            worker.join(60.0)

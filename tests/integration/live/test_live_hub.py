@@ -16,47 +16,17 @@ from protocols.core.ranges import MAX_DISTORTION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
 from tests.support.rigs import Session, simulate
+from tests.support.session_messages import info_messages, row_messages
 
 SETTINGS = LiveSettings(window_s=60.0, interval_s=2.0)
 
 
 def messages(session: Session, boot: str = "boot0", shift_s: float = 0.0) -> list[Message]:
     """Camera infos first, then one observation a row, as agents publish them."""
-    out: list[Message] = []
-    for name, camera in session.rig.cameras.items():
-        lens = camera.intrinsics
-        assert lens is not None
-        out.append(
-            pb.CameraInfo(
-                schema_version=1,
-                camera=name,
-                boot_id=boot,
-                width=lens.width,
-                height=lens.height,
-                fps=camera.fps,
-                matrix=lens.matrix.ravel().tolist(),
-                distortions=lens.distortions.tolist(),
-                fisheye=lens.fisheye,
-            )
-        )
-    counts: dict[str, int] = {}
-    for i in np.argsort(
-        session.time - np.array([session.time[np.array(session.camera) == c].min() for c in session.camera])
-    ):
-        name = session.camera[i]
-        counts[name] = counts.get(name, -1) + 1
-        out.append(
-            pb.Observation(
-                schema_version=1,
-                camera=name,
-                boot_id=boot,
-                sequence=counts[name],
-                frame=int(session.frame[i]),
-                device_time_ns=round((session.time[i] + shift_s) * NANOSECONDS),
-                detections=[pb.Detection(u=session.pixels[i, 0], v=session.pixels[i, 1], score=1.0, label="marker")],
-            )
-        )
-    return out
+    begins = {name: session.time[session.of_camera(name)].min() for name in session.rig.cameras}
+    order = np.argsort(session.time - np.array([begins[name] for name in session.camera]))
+    rows = row_messages(session, lambda _: boot, order.tolist(), lambda i: float(session.time[i] + shift_s))
+    return [*info_messages(session, lambda _: boot), *rows]
 
 
 def feed(hub: LiveHub, stream: list[Message], batch: int = 200) -> list[Message]:

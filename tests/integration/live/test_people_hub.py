@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +25,7 @@ from protocols.session.calibration import read_calibration
 from protocols.topics import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
 from tests.support.people_traffic import Traffic, film
 from tests.support.samples import eventually
+from tests.support.threads import running
 
 SCENE = scenes.get_people_scene(21, 4, 3)
 
@@ -99,14 +99,11 @@ def test_tracks_and_predictions_come_over_the_bus(traffic: Traffic, known: Path)
     """Observations in over a real router; tracks and predictions out."""
     endpoint = free_endpoint()
     config = BusConfig(mode="client", connect=(endpoint,))
-    stop = threading.Event()
     hub = LiveHub(LiveSettings(), known=KnownCalibration(*read_calibration(known)))
     with Router(endpoint), open_bus("yard", config) as bus, open_bus("yard", config) as cameras:
-        thread = threading.Thread(target=run_hub, args=(hub, bus, "hub", stop))
         tracks, predictions = cameras.subscribe(TRACK), cameras.subscribe(PREDICTION)
         publishers = {c.name: cameras.publisher(OBSERVATION, c.name) for c in SCENE.cameras}
-        thread.start()
-        try:
+        with running(lambda stop: run_hub(hub, bus, "hub", stop)) as stop:
             for publisher in publishers.values():
                 assert publisher.wait_matched(20.0)
             for number, message in enumerate(traffic.messages()):
@@ -124,13 +121,6 @@ def test_tracks_and_predictions_come_over_the_bus(traffic: Traffic, known: Path)
             assert eventually(all_received, 60.0)
             assert eventually(lambda: all_received() and len({t.label for t in received_tracks}) >= 3, 20.0)
             last = predictions.drain()[-1].message
-        finally:
-            stop.set()
-            thread.join(30.0)
-            for publisher in publishers.values():
-                publisher.close()
-            tracks.close()
-            predictions.close()
     assert {t.state for t in received_tracks} <= {"confirmed", "coasting", "lost"}
     assert all(t.kind == "person" for t in received_tracks)
     newest = max(received_tracks, key=lambda t: t.reference_time_ns)

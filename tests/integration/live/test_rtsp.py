@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -17,6 +16,7 @@ from edge.video.rtp_encoder import RtpEncoder
 from edge.video.rtsp_server import PATH, RtspServer
 from protocols.core.errors import InputError
 from tests.support.samples import eventually
+from tests.support.threads import looping
 
 av: Any = pytest.importorskip("av", reason="PyAV is not installed: nothing of RTSP is tested")
 SIZE = (320, 240)
@@ -36,21 +36,14 @@ def frame_image(k: int) -> np.ndarray:
 def serving() -> Iterator[RtspServer]:
     """A server with a new image every 20 ms."""
     number = [0]
-    stop = threading.Event()
     with RtspServer("127.0.0.1", 0, lambda: frame_image(number[0]), SIZE, 30.0) as server:
 
-        def run() -> None:
-            while not stop.wait(0.02):
-                number[0] += 1
-                server.notify_frame()
+        def show() -> None:
+            number[0] += 1
+            server.notify_frame()
 
-        thread = threading.Thread(target=run)
-        thread.start()
-        try:
+        with looping(show, 0.02):
             yield server
-        finally:
-            stop.set()
-            thread.join()
 
 
 def exchange(server: RtspServer, *requests: bytes) -> bytes:

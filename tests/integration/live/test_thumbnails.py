@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 
 import cv2
@@ -17,6 +16,7 @@ from protocols.topics import OBSERVATION, PICTURE
 from protocols.validation.codec import encode
 from tests.integration.live.test_camera_agent import ScriptedDetector
 from tests.support.samples import eventually
+from tests.support.threads import running
 
 
 def square_image(width: int, height: int) -> np.ndarray:
@@ -63,19 +63,14 @@ class EndlessDevice:
 
 @pytest.mark.parametrize("rate", [20.0, 0.0])
 def test_thumbnails_are_published_to_subscribers_unless_disabled(rate: float) -> None:
-    network, stop = MemoryHub(), threading.Event()
+    network = MemoryHub()
     with MemoryBus(network) as agents, MemoryBus(network) as bus:
         observations = bus.subscribe(OBSERVATION)
         agent = CameraAgent(EndlessDevice(), ScriptedDetector(), agents, "cam0", pictures_hz=rate)  # type: ignore[arg-type]
-        loop = threading.Thread(target=agent.run, args=(stop,))
-        loop.start()
-        try:
+        with running(agent.run):
             assert eventually(lambda: bool(observations.drain()))
             sent = [publisher for publisher in network.publishers if publisher.key.endswith("/picture")]
             assert [len(publisher.cache) for publisher in sent] == [0], "no subscriber yet"
             pictures = bus.subscribe(PICTURE)
             came = eventually(lambda: bool(pictures.drain()), 10.0 if rate else 1.5)
             assert came == (rate > 0.0)
-        finally:
-            stop.set()
-            loop.join(10.0)

@@ -32,6 +32,7 @@ from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE, STATUS, TOPICS
 from tests.support.samples import SAMPLES, camera_info, eventually, observation
+from tests.support.threads import running
 
 SECOND = 1_000_000_000
 
@@ -39,16 +40,10 @@ SECOND = 1_000_000_000
 @contextmanager
 def recording(path: Path, bus: Bus) -> Iterator[list[RecorderResult]]:
     """A recorder on its own thread; its result is in the list once the context is left."""
-    stop = threading.Event()
     results: list[RecorderResult] = []
     config = RecorderConfig(out=path)
-    thread = threading.Thread(target=lambda: results.append(run_recorder(config, bus, stop)))
-    thread.start()
-    try:
+    with running(lambda stop: results.append(run_recorder(config, bus, stop))):
         yield results
-    finally:
-        stop.set()
-        thread.join(10.0)
 
 
 def observations(path: Path) -> list[LogMessage]:
@@ -105,12 +100,8 @@ def test_pictures_are_thinned_and_not_even_asked_for_at_rate_0(tmp_path: Path, h
     hub = MemoryHub(clock_ns=lambda: next(now))
     with MemoryBus(hub) as agents, MemoryBus(hub) as bus:
         publisher = agents.publisher(PICTURE, "cam0")
-        results: list[RecorderResult] = []
-        stop = threading.Event()
         config = RecorderConfig(out=tmp_path / "a.mcap", pictures_hz=hz)
-        loop = threading.Thread(target=lambda: results.append(run_recorder(config, bus, stop)))
-        loop.start()
-        try:
+        with running(lambda stop: run_recorder(config, bus, stop)):
             wanted = len(RECORDED) - (not kept)
             assert eventually(lambda: len(hub.subscriptions) == wanted)
             assert publisher.wait_matched(0.0) == bool(kept), "a camera sends only what somebody wants"
@@ -118,9 +109,6 @@ def test_pictures_are_thinned_and_not_even_asked_for_at_rate_0(tmp_path: Path, h
                 message = SAMPLES[PICTURE]()
                 message.frame = index
                 publisher.put(message)
-        finally:
-            stop.set()
-            loop.join(20.0)
     frames = [item.message.frame for item in LogReader(tmp_path / "a.mcap").messages([PICTURE])]  # type: ignore[attr-defined]
     if hz == 2.0:  # the recorder's own messages take some ticks of this clock
         assert 3 <= len(frames) <= 6

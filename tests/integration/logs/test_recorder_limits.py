@@ -31,6 +31,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION, STATUS
 from tests.integration.logs.test_record_replay import RECORDER
 from tests.support.samples import eventually, observation
+from tests.support.threads import running
 
 
 def test_recording_ends_with_a_complete_log_before_the_disk_is_full(tmp_path: Path) -> None:
@@ -68,7 +69,7 @@ def test_a_recording_does_not_start_on_a_full_disk(tmp_path: Path) -> None:
 
 
 def test_a_recorder_waits_for_space_and_goes_on_in_a_new_log(tmp_path: Path) -> None:
-    hub, stop = MemoryHub(), threading.Event()
+    hub = MemoryHub()
     room = [500_000_000]
     with MemoryBus(hub) as sending, MemoryBus(hub) as bus:
         statuses = sending.subscribe(STATUS, "recorder")
@@ -79,11 +80,7 @@ def test_a_recorder_waits_for_space_and_goes_on_in_a_new_log(tmp_path: Path) -> 
             return bool(last) and last[0].state == state and text in last[0].message  # type: ignore[attr-defined]
 
         config = RecorderConfig(out=tmp_path / "logs")
-        recorder = threading.Thread(
-            target=record_on_command, args=(config, bus, stop), kwargs={"free": lambda _: room[0]}
-        )
-        recorder.start()
-        try:
+        with running(lambda stop: record_on_command(config, bus, stop, free=lambda _: room[0])):
             assert eventually(lambda: reported("running", "messages"))
             room[0] = 150_000_000
             assert eventually(lambda: reported("degraded", "not recording: 150 MB are free"))
@@ -95,9 +92,6 @@ def test_a_recorder_waits_for_space_and_goes_on_in_a_new_log(tmp_path: Path) -> 
             camera.put(observation("cam0", 7))
             assert eventually(lambda: reported("running", "messages"))
             assert eventually(lambda: reported("running", "messages")), "the status after it, so that it is on the disk"
-        finally:
-            stop.set()
-            recorder.join(10.0)
     first, second = sorted((tmp_path / "logs").glob("*.mcap"))
     assert [one.message.sequence for one in LogReader(second).messages([OBSERVATION])] == [7]  # type: ignore[attr-defined]
     assert LogReader(first).damage == LogReader(second).damage == ""

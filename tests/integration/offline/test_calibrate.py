@@ -44,18 +44,6 @@ def run(session: Session) -> Solved:
     return Solved(session, calibrate(session.rig, session.observations()))
 
 
-def without(session: Session, drop: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Session:
-    keep = np.flatnonzero(~drop)
-    return replace(
-        session,
-        camera=[session.camera[i] for i in keep],
-        label=[session.label[i] for i in keep],
-        frame=session.frame[keep],
-        time=session.time[keep],
-        pixels=session.pixels[keep],
-    )
-
-
 @pytest.fixture(scope="module")
 def five() -> Solved:
     """Five cameras with different time origins, mixed frame rates and one fisheye lens."""
@@ -144,8 +132,8 @@ def test_the_trajectory_is_limited_to_times_when_two_cameras_saw_the_point(five:
 def test_the_trajectory_has_a_gap_where_only_one_camera_saw_the_point() -> None:
     """A gap of 0.9 s, shorter than what the spline bridges, is not published as measured."""
     session = simulate(56, 2, 20, late=0, epochs=(0.0,), ppm=0)
-    hole = np.array([n == "cam1" for n in session.camera]) & (session.time > 10) & (session.time < 10.9)
-    (table,) = run(without(session, hole)).found.trajectories
+    hole = session.of_camera("cam1") & (session.time > 10) & (session.time < 10.9)
+    (table,) = run(session.where(~hole)).found.trajectories
     assert not ((table.time > 10.25) & (table.time < 10.65)).any()
     assert ((table.time > 9.8) & (table.time < 10.1)).any()
     assert ((table.time > 10.8) & (table.time < 11.1)).any()
@@ -239,20 +227,19 @@ def test_two_cameras_that_see_different_objects_are_refused(seed: int) -> None:
 
 def test_a_camera_without_observations_is_refused_by_name_and_one_without_intrinsics_is_self_calibrated() -> None:
     session = simulate(45, 4, 15)
-    session = without(session, np.array([name == "cam1" for name in session.camera]))
+    session = session.where(~session.of_camera("cam1"))
     rig = replace(session.rig, cameras=dict(session.rig.cameras))
     rig.cameras["cam3"] = replace(rig.cameras["cam3"], intrinsics=None)
     found = calibrate(rig, session.observations())
     assert set(found.cameras) == {"cam0", "cam2", "cam3"}
     assert "no observations" in found.refused["cam1"]
-    lens = session.rig.cameras["cam3"].intrinsics
-    assert lens is not None
+    lens = session.lens("cam3")
     assert found.cameras["cam3"].intrinsics.focal == pytest.approx(lens.focal, rel=0.03)
 
 
 def test_a_camera_of_three_rows_is_refused_by_name() -> None:
     session = simulate(46, 3, 15)
-    session = without(session, np.array([n == "cam2" for n in session.camera]) & (session.frame > 2))
+    session = session.where(~session.of_camera("cam2") | (session.frame <= 2))
     found = calibrate(session.rig, session.observations())
     assert list(found.refused) == ["cam2"]
     assert "rows" in found.refused["cam2"]
@@ -265,7 +252,7 @@ def test_one_camera_alone_is_refused() -> None:
 
 def test_a_session_without_intrinsics_is_refused_with_a_reason_per_camera() -> None:
     session = simulate(47, 2, 10)
-    rig = replace(session.rig, cameras={n: replace(c, intrinsics=None) for n, c in session.rig.cameras.items()})
+    rig = session.without_lenses().rig
     with pytest.raises(Refused) as caught:
         calibrate(rig, session.observations())
     assert set(caught.value.cameras) == {"cam0", "cam1"}
@@ -279,7 +266,7 @@ def test_a_still_marker_is_refused() -> None:
 
 def test_a_frozen_camera_is_refused_and_the_others_solved() -> None:
     session = simulate(49, 3, 20)
-    session.pixels[[n == "cam1" for n in session.camera]] = [640.0, 360.0]
+    session.pixels[session.of_camera("cam1")] = [640.0, 360.0]
     solved = run(session)
     assert list(solved.found.refused) == ["cam1"]
     assert max(map(abs, solved.clock_errors().values())) < 1e-3

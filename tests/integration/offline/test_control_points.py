@@ -132,7 +132,7 @@ def slow_errors(session: rigs.Session, std: float) -> Floats:
     """Errors (n, 2) [px] that are correlated from frame to frame."""
     rng, out = np.random.default_rng(6), np.zeros_like(session.pixels)
     for name in session.rig.cameras:
-        mine = np.flatnonzero([one == name for one in session.camera])
+        mine = np.flatnonzero(session.of_camera(name))
         steps = rng.normal(0.0, std, (len(mine), 2))
         for i in range(1, len(mine)):
             steps[i] = 0.98 * steps[i - 1] + np.sqrt(1.0 - 0.98**2) * steps[i]

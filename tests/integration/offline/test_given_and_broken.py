@@ -42,10 +42,6 @@ DRONE2 = Path(__file__).parents[4] / "shared" / "data" / "drone2"
 DRONE1 = DRONE2.with_name("drone1")
 
 
-def of(session: rigs.Session, name: str) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    return np.array([one == name for one in session.camera])
-
-
 @pytest.fixture(scope="module")
 def four() -> tuple[rigs.Session, Calibration]:
     session = rigs.simulate(1, 4, 30.0)
@@ -83,8 +79,7 @@ def test_a_focal_length_with_a_std_is_an_observation_of_that_weight(solver: str)
         wrong = with_focal(wrong, name, factor)
     found = calibrate(wrong.rig, wrong.observations(), solver=solver)
     for name, camera in found.cameras.items():
-        lens = session.rig.cameras[name].intrinsics
-        assert lens is not None
+        lens = session.lens(name)
         assert abs(camera.intrinsics.focal / lens.focal - 1.0) < 4.0 * camera.focal_std < 0.02
         assert np.array_equal(camera.intrinsics.distortions, lens.distortions)
         assert [one.std for one in camera.sensitivities] == [0.01]
@@ -129,7 +124,7 @@ def test_separate_points_reach_the_optimum(solver: str) -> None:
 def test_a_broken_camera_is_named_and_the_others_stay(kind: str) -> None:
     session = rigs.simulate(0, 5, 30.0)
     before, _ = broken_cameras.timed(broken_cameras.without(session, "cam4"))
-    broken = broken_cameras.BREAKAGES[kind](session, "cam4", of(session, "cam4"), np.random.default_rng(0))
+    broken = broken_cameras.BREAKAGES[kind](session, "cam4", session.of_camera("cam4"), np.random.default_rng(0))
     found, _ = broken_cameras.timed(broken)
     said = {"wrong lens": "lens is refuted", "crop": "principal point"}
     assert said.get(kind, "") in found.refused["cam4"]
@@ -138,7 +133,7 @@ def test_a_broken_camera_is_named_and_the_others_stay(kind: str) -> None:
 
 def test_a_picture_upside_down_whose_centre_is_elsewhere_is_named() -> None:
     session = rigs.simulate(101, 6, 40.0)
-    turned = broken_cameras.turned(session, "cam4", of(session, "cam4"), np.random.default_rng(0))
+    turned = broken_cameras.turned(session, "cam4", session.of_camera("cam4"), np.random.default_rng(0))
     named = [text.split(":")[0] for text in calibrate(turned.rig, turned.observations()).warnings if "refuted" in text]
     assert named == ["cam4"]
 
@@ -146,7 +141,7 @@ def test_a_picture_upside_down_whose_centre_is_elsewhere_is_named() -> None:
 def test_the_pairs_of_a_camera_with_a_wrong_lens_are_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its starts end in one minimum of the essential matrix, far above the fundamental matrix's."""
     session = rigs.simulate(103, 8, 40.0)
-    half = broken_cameras.BREAKAGES["half size"](session, "cam7", of(session, "cam7"), np.random.default_rng(0))
+    half = broken_cameras.BREAKAGES["half size"](session, "cam7", session.of_camera("cam7"), np.random.default_rng(0))
     solve, refine, searched, starts = pair_network._solve, pair_solver.refine, list[tuple[str, str]](), list[int]()
     monkeypatch.setattr(pair_network, "_solve", lambda *of, **how: (searched.append(of[1]), solve(*of, **how))[1])
     monkeypatch.setattr(pair_solver, "refine", lambda *of, **how: (starts.append(1), refine(*of, **how))[1])
@@ -176,7 +171,7 @@ def test_resection_tells_a_wrong_lens_and_a_mirrored_image_from_a_camera_that_sa
     good = broken_cameras.without(session, "cam3")
     prepared, pairs = solve_pairs(prepare(good.rig, good.observations()), lambda text, share: None)
     path = solve_network(prepared, pairs, lambda text, share: None).reconstruction
-    mine, rng = of(session, "cam3"), np.random.default_rng(0)
+    mine, rng = session.of_camera("cam3"), np.random.default_rng(0)
     for broken, words in (
         (with_focal(session, "cam3", 0.6), "focal length 1.6"),
         (broken_cameras.mirrored(session, "cam3", mine, rng), "mirrored"),
@@ -225,7 +220,7 @@ def test_a_false_detection_that_stays_in_one_place_does_not_displace_a_resected_
 
 def test_a_broken_camera_does_not_get_the_long_search_that_a_pair_alone_gets(monkeypatch: pytest.MonkeyPatch) -> None:
     session = rigs.simulate(0, 4, 30.0)
-    broken = broken_cameras.shuffled(session, "cam0", of(session, "cam0"), np.random.default_rng(0))
+    broken = broken_cameras.shuffled(session, "cam0", session.of_camera("cam0"), np.random.default_rng(0))
     prepared, tried = prepare(broken.rig, broken.observations()), list[float]()
     refine = _PairSearch._refine_candidate
 
@@ -256,7 +251,7 @@ def test_a_clock_step_is_reported_with_time_and_size_and_no_other_clock_follows(
     four: tuple[rigs.Session, Calibration],
 ) -> None:
     session, before = four
-    mine = of(session, "cam2")
+    mine = session.of_camera("cam2")
     at = float(np.quantile(session.time[mine], 0.6))
     time = session.time + np.where(mine & (session.time >= at), 0.03, 0.0)
     found = calibrate(session.rig, replace(session, time=time).observations())
@@ -370,7 +365,7 @@ def test_the_lag_is_stated_in_the_middle_of_the_shared_span(four: tuple[rigs.Ses
         assert (table["lag_std_s"] > 0.0) == (table["clock_rate_ppm_std"] > 0.0) == (name != found.reference)
         both = []
         for one in (found.reference, name):
-            seen = session.time[of(session, one)]
+            seen = session.time[session.of_camera(one)]
             both.append([session.true_time(one, float(seen.min())), session.true_time(one, float(seen.max()))])
         begin, end = np.array(both).T
         middle = 0.5 * (begin.max() + end.min())
@@ -384,7 +379,7 @@ def test_rates_are_those_of_crystals_unless_refuted() -> None:
         assert abs(camera.time_map.clock_rate - 1.0) < 4e-4
     assert not [text for text in found.warnings if "frame rate" in text]
     session = rigs.simulate(9, 3, 30.0, ppm=30.0)
-    mine = of(session, "cam1")
+    mine = session.of_camera("cam1")
     start = float(session.time[mine].min())
     time = np.where(mine, start + 1.002 * (session.time - start), session.time)
     found = calibrate(session.rig, replace(session, time=time).observations())
@@ -464,7 +459,7 @@ def test_no_row_of_a_path_is_outside_the_observed_span(four: tuple[rigs.Session,
     session, found = four
     spans = []
     for name, camera in found.cameras.items():
-        time = session.time[of(session, name)]
+        time = session.time[session.of_camera(name)]
         spans.append(camera.time_map.clock_rate * np.array([time.min(), time.max()]) + camera.time_map.time_offset)
     begin, end = sorted(span[0] for span in spans)[1], sorted(span[1] for span in spans)[-2]
     (path,) = found.trajectories
@@ -541,7 +536,7 @@ def test_the_stds_that_a_detector_states_are_checked_against_its_residuals(facto
         session.time,
         session.pixels,
         np.full(len(session.time), np.nan),
-        stds=np.where(of(session, "cam1"), factor * 0.5, np.nan),
+        stds=np.where(session.of_camera("cam1"), factor * 0.5, np.nan),
         order=session.rig.cameras,
     )
     found = calibrate(session.rig, rows)
@@ -556,7 +551,7 @@ def test_the_stds_that_a_detector_states_are_checked_against_its_residuals(facto
 def test_a_camera_whose_residuals_are_far_larger_than_the_others_is_named() -> None:
     """Detections that wander by some pixels: no lens and no clock explains them, and no test of one tells."""
     session = rigs.simulate(2, 4, 20.0, noise=0.5)
-    mine = of(session, "cam3")
+    mine = session.of_camera("cam3")
     wander = 3.0 * np.sin(np.add.outer(2.0 * np.pi * session.time[mine] / 1.3, [0.0, 1.0]))
     session.pixels[mine] += wander
     found = calibrate(session.rig, session.observations())

@@ -35,21 +35,6 @@ def filmed() -> Session:
     return simulate(91, 3, 20)
 
 
-def write_session(folder: Path, session: Session, metadata: str = "", observations: Observations | None = None) -> Path:
-    folder.mkdir()
-    tables = [f"[metadata]\n{metadata}\n"]
-    for name, camera in session.rig.cameras.items():
-        lens = camera.intrinsics
-        assert lens is not None
-        tables.append(
-            f'[{name}]\nname = "{name}"\nsize = [{lens.width}, {lens.height}]\nfps = {camera.fps}\n'
-            f"matrix = {lens.matrix.tolist()}\ndistortions = {lens.distortions.tolist()}\n"
-        )
-    (folder / "rig.toml").write_text("\n".join(tables))
-    write_observations(folder / "observations.csv", observations or session.observations())
-    return folder
-
-
 def test_a_clock_that_is_set_while_recording_costs_its_shorter_side(filmed: Session) -> None:
     """From uptime to Unix time in the middle of a recording: once asked for 253 GiB of memory."""
     seen = filmed.observations()
@@ -101,7 +86,7 @@ def test_contradicting_distances_are_refused(
     filmed: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     metadata = 'distances = [["cam0", "cam1", 1.0], ["cam0", "cam2", 1000.0]]'
-    folder = write_session(tmp_path / "session", filmed, metadata)
+    folder = filmed.write(tmp_path / "session", metadata)
     assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 3
     assert "contradict" in capsys.readouterr().err
     assert run(["calibrate", str(folder), "--solver", "distributed", "--seed", "-1", "--out", str(tmp_path / "o")]) == 2
@@ -110,7 +95,7 @@ def test_contradicting_distances_are_refused(
 def test_an_answer_with_distances_is_plain_toml_in_the_rigs_units(filmed: Session, tmp_path: Path) -> None:
     apart = float(np.linalg.norm(filmed.poses["cam0"].position - filmed.poses["cam1"].position))
     metadata = f'units = "cm"\ndistances = [["cam0", "cam1", {100 * apart}]]'
-    folder = write_session(tmp_path / "session", filmed, metadata)
+    folder = filmed.write(tmp_path / "session", metadata)
     assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 0
     found = tomllib.loads((tmp_path / "out" / "calibration.toml").read_text())
     assert "distances" not in found["metadata"]
@@ -119,7 +104,7 @@ def test_an_answer_with_distances_is_plain_toml_in_the_rigs_units(filmed: Sessio
 
 
 def test_known_poses_keep_their_own_scale_and_units(filmed: Session, tmp_path: Path) -> None:
-    folder = write_session(tmp_path / "session", filmed)
+    folder = filmed.write(tmp_path / "session")
     assert run(["calibrate", str(folder), "--out", str(tmp_path / "first")]) == 0
     known = tmp_path / "first" / "calibration.toml"
     assert run(["calibrate", str(folder), "--from-known", str(known), "--out", str(tmp_path / "again")]) == 0
@@ -127,7 +112,7 @@ def test_known_poses_keep_their_own_scale_and_units(filmed: Session, tmp_path: P
 
 
 def test_an_earlier_answer_as_rig_brings_no_old_refusals(filmed: Session, tmp_path: Path) -> None:
-    folder = write_session(tmp_path / "session", filmed, 'refused = { cam7 = "long ago" }\nscale = "metric"')
+    folder = filmed.write(tmp_path / "session", 'refused = { cam7 = "long ago" }\nscale = "metric"')
     assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 0
     metadata = tomllib.loads((tmp_path / "out" / "calibration.toml").read_text())["metadata"]
     assert "refused" not in metadata
@@ -136,12 +121,12 @@ def test_an_earlier_answer_as_rig_brings_no_old_refusals(filmed: Session, tmp_pa
 
 @pytest.mark.parametrize("reference", ['"camX"', "7", '["cam0"]'])
 def test_a_reference_that_is_no_camera_is_bad_input(filmed: Session, tmp_path: Path, reference: str) -> None:
-    folder = write_session(tmp_path / "session", filmed, f"reference = {reference}")
+    folder = filmed.write(tmp_path / "session", f"reference = {reference}")
     assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 2
 
 
 def test_brackets_in_a_path_are_no_markup(filmed: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_session(tmp_path / "session", filmed)
+    folder = filmed.write(tmp_path / "session")
     assert run(["calibrate", str(folder), "--out", str(tmp_path / "o[bold]")]) == 0
     shown = capsys.readouterr().out
     assert "o[bold]" in shown
@@ -184,7 +169,7 @@ def test_an_interrupt_while_modules_are_imported_is_one_line(tmp_path: Path) -> 
 def test_an_output_folder_that_cannot_be_is_told_before_the_work(
     filmed: Session, tmp_path: Path, out: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = write_session(tmp_path / "session", filmed)
+    folder = filmed.write(tmp_path / "session")
     (tmp_path / "file").write_text("")
     (tmp_path / "locked").mkdir()
     # Who runs the tests may have all rights.
@@ -231,7 +216,7 @@ def test_pixels_of_another_convention_are_named(
 ) -> None:
     """All these gave an answer, of another world or a mirrored one, with warnings at most."""
     session = simulate(3, 4, 30.0)
-    folder = write_session(tmp_path / "session", session)
+    folder = session.write(tmp_path / "session")
     seen = session.observations()
     tracks = {key: replace(track, pixels=change(track.pixels)) for key, track in seen.tracks.items()}
     write_observations(folder / "observations.csv", Observations(tracks))
@@ -297,7 +282,7 @@ def test_what_is_no_file_of_its_kind_is_refused(
     """A pipe that nobody writes to was waited for; /dev/zero was read until the memory was full."""
     (tmp_path / "images").mkdir()
     cv2.imwrite(str(tmp_path / "images/0.png"), np.zeros((48, 64, 3), np.uint8))
-    write_session(tmp_path / "session", filmed)
+    filmed.write(tmp_path / "session")
     command = [str(tmp_path / word) if word[0].isupper() or "/" in word else word for word in COMMANDS[what]]
     command = [str(tmp_path / word) if word in ("images", "session") else word for word in command]
     file = Path(next(word for word in command if word.startswith(str(tmp_path / "X."))))
@@ -363,7 +348,7 @@ def test_what_a_terminal_would_obey_is_shown_as_an_escape(tmp_path: Path, capsys
 
 
 def test_a_terminal_without_unicode_gets_escapes_and_no_traceback(tmp_path: Path, filmed: Session) -> None:
-    write_session(tmp_path / "session", filmed)
+    filmed.write(tmp_path / "session")
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     done = subprocess.run(
         [sys.executable, "-m", "deploy", "info", str(tmp_path / "session")],
@@ -378,7 +363,7 @@ def test_a_terminal_without_unicode_gets_escapes_and_no_traceback(tmp_path: Path
 @pytest.mark.parametrize("closed", ["stdin", "stdout", "stderr"])
 def test_a_stream_that_is_closed_from_the_start_is_no_error(tmp_path: Path, filmed: Session, closed: str) -> None:
     """Python has None in its place."""
-    write_session(tmp_path / "session", filmed)
+    filmed.write(tmp_path / "session")
     place = {"stdin": 0, "stdout": 1, "stderr": 2}[closed]
     command = f'exec "$0" -m deploy info "$1" {place}>&-'
     done = subprocess.run(
@@ -394,7 +379,7 @@ def test_a_reader_that_closes_the_pipe_is_no_error() -> None:
 
 
 def test_names_that_are_no_unicode_or_not_in_the_locale_are_no_bug(tmp_path: Path, filmed: Session) -> None:
-    folder = write_session(tmp_path / "session\udcff", filmed)
+    folder = filmed.write(tmp_path / "session\udcff")
     assert run(["calibrate", str(folder), "--out", str(tmp_path / "out\udcff")]) == 0
     text = (tmp_path / "out\udcff/calibration.toml").read_text().replace("cam1", "cämera 日")
     calibration = tmp_path / "calibration.toml"
@@ -412,7 +397,7 @@ def test_names_that_are_no_unicode_or_not_in_the_locale_are_no_bug(tmp_path: Pat
 @pytest.mark.parametrize("megabytes", [120, 300, 400])
 def test_little_memory_is_one_line(tmp_path: Path, filmed: Session, megabytes: int) -> None:
     """Libraries that cannot be loaded, and OpenBLAS, which waits for ever."""
-    write_session(tmp_path / "session", filmed)
+    filmed.write(tmp_path / "session")
     command = f'ulimit -v {megabytes * 1000}; exec "$0" -m deploy calibrate "$1" --out "$1/out"'
     done = subprocess.run(
         ["sh", "-c", command, sys.executable, str(tmp_path / "session")], capture_output=True, check=False, timeout=60

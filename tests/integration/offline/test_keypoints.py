@@ -15,9 +15,9 @@ from protocols.core.errors import InputError
 from protocols.formats import keypoints
 from protocols.geometry.types import Floats
 from protocols.session.calibration import read_calibration
-from protocols.session.folder import write_observations
 from protocols.session.observations import read_observations
 from tests.support.board_session import BoardWorld, board_world
+from tests.support.rigs import write_session
 
 Capture = pytest.CaptureFixture[str]
 JOINTS = [
@@ -294,16 +294,7 @@ def test_a_person_calibrates_the_cameras_in_metres_by_the_given_height(tmp_path:
     world, joints = skeleton_world()
     world = replace(world, points=joints)
     seen = world.observations(12.0, noise=1.0)
-    session = tmp_path / "session"
-    session.mkdir()
-    write_observations(session / "observations.csv", seen)
-    (session / "rig.toml").write_text(
-        "\n".join(
-            f'[{name}]\nname = "{name}"\nsize = [1280, 720]\nfps = {one.fps}\nmatrix = {one.lens.matrix.tolist()}\n'
-            f"distortions = {one.lens.distortions.tolist()}"
-            for name, one in world.cameras.items()
-        )
-    )
+    session = write_session(tmp_path / "session", world.rig(), seen)
     out = tmp_path / "out"
     assert run(["calibrate", str(session), "--limb", "left_hip-tail=1", "--out", str(out)]) == 2
     assert "labels are left_ankle" in capsys.readouterr().err

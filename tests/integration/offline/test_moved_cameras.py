@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from hub.calibration.pipeline import calibrate
-from protocols.core.clocks import CameraTime
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.session.observations import Observations
@@ -16,22 +15,10 @@ from protocols.session.rig import Rig
 from tests.support.rigs import Session, simulate
 
 
-def turned(session: Session, name: str, since: float, angle: float) -> Session:
-    """The session with a camera turned about its vertical axis from a true time on [s, rad]."""
-    lens = session.rig.cameras[name].intrinsics
-    assert lens is not None
-    pixels, clock = session.pixels.copy(), session.clocks[name]
-    for row in np.flatnonzero(np.array(session.camera) == name):
-        if float(clock.reference_from_camera(CameraTime(float(session.time[row])))) > since:
-            ray = np.append(lens.unproject(pixels[row : row + 1])[0], 1.0)
-            pixels[row] = lens.project((so3.exp(np.array([0.0, angle, 0.0])) @ ray)[None])[0]
-    return replace(session, pixels=pixels)
-
-
 @pytest.mark.parametrize(("cameras", "since", "angle"), [(4, 8.0, 0.03), (5, 20.0, 0.1), (3, 21.0, 0.3)])
 def test_a_turned_camera_is_named_and_its_longer_side_is_used(cameras: int, since: float, angle: float) -> None:
     session = simulate(5, cameras, 30)
-    found = calibrate(*_given(turned(session, "cam2", since, angle)), thorough=True)
+    found = calibrate(*_given(session.turned("cam2", since, angle)), thorough=True)
     (warning,) = [text for text in found.warnings if "it was moved" in text]
     assert warning.startswith("cam2: ")
     assert ("rows before that" in warning) == (since < 15.0)
@@ -49,7 +36,7 @@ def test_a_turned_camera_is_named_and_its_longer_side_is_used(cameras: int, sinc
 
 def test_a_moved_camera_is_named_though_the_path_follows_it_where_only_one_other_sees_the_target() -> None:
     windows = [(0.0, 60.0)] * 2 + [(0.0, 27.0), (14.0, 60.0)]
-    session = turned(simulate(16, 4, 60, outliers=0.02, windows=windows), "cam1", 21.0, 0.08)
+    session = simulate(16, 4, 60, outliers=0.02, windows=windows).turned("cam1", 21.0, 0.08)
     (warning,) = [text for text in calibrate(*_given(session), thorough=True).warnings if "it was moved" in text]
     assert warning.startswith("cam1: ")
 
@@ -59,7 +46,7 @@ def test_a_move_of_one_of_two_cameras_is_named_and_the_longer_side_is_used(
     seed: int, since: float, angle: float
 ) -> None:
     session = simulate(seed, 2, 40)
-    found = calibrate(*_given(turned(session, "cam1", since, angle)), thorough=True)
+    found = calibrate(*_given(session.turned("cam1", since, angle)), thorough=True)
     (warning,) = [text for text in found.warnings if "was moved" in text]
     shown = session.shown("cam0", since)
     assert warning.startswith("one of cam0, cam1 was moved at cam0's time ")
@@ -77,8 +64,7 @@ def test_of_two_cameras_a_clock_that_steps_or_a_wrong_lens_is_no_move(seed: int)
     session = simulate(seed, 2, 40)
     late = (np.array(session.camera) == "cam1") & (session.time > session.middle("cam1"))
     stepped = replace(session, time=session.time + 0.05 * late)
-    lens = session.rig.cameras["cam1"].intrinsics
-    assert lens is not None
+    lens = session.lens("cam1")
     longer = replace(lens, matrix=lens.matrix @ np.diag([1.02, 1.02, 1.0]))
     wrong = {**session.rig.cameras, "cam1": replace(session.rig.cameras["cam1"], intrinsics=longer)}
     for given in (session, stepped, replace(session, rig=replace(session.rig, cameras=wrong))):

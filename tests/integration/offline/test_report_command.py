@@ -13,6 +13,7 @@ from deploy.cli import run
 from deploy.offline.report_input import load_report_input
 from protocols.core.errors import Refused
 from protocols.session.calibration import Calibration
+from tests.support.command_line import refusal
 
 SIZE_LIMIT = 6 * 1024 * 1024
 
@@ -103,10 +104,7 @@ def test_invalid_results_are_named(
     content: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "result.json").write_text(content, encoding="utf-8")
-    assert run(["report", str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert expected in error
-    assert error.count("\n") == 1
+    assert expected in refusal(capsys, ["report", str(tmp_path)])
 
 
 def test_bad_arguments_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,25 +19,16 @@ from hub.calibration.self_calibration import MAX_FOCAL_STD, focal_prior, initial
 from hub.sync.hypothesis import PairFit, PairSolution
 from hub.two_view.relative_pose import FundamentalMatrix, relative_pose_between
 from protocols.core.errors import InputError
-from protocols.session.folder import read_folder, write_observations
+from protocols.session.folder import read_folder
 from protocols.session.rig import RigCamera, read_rig
 from tests.support.rigs import Path as Curve
 from tests.support.rigs import Session, random_lens, random_path, random_poses, simulate
 from tests.support.videos import numbered_image, write_video
 
 
-def without_lenses(session: Session, *names: str) -> Session:
-    """The session without the intrinsics of some cameras, or of all."""
-    cameras = {
-        name: replace(camera, intrinsics=None) if name in names or not names else camera
-        for name, camera in session.rig.cameras.items()
-    }
-    return replace(session, rig=replace(session.rig, cameras=cameras))
-
-
 def test_four_unknown_lenses_are_estimated_with_consistent_stds() -> None:
     full = simulate(70, 4, 30)
-    found = calibrate(without_lenses(full).rig, full.observations())
+    found = calibrate(full.without_lenses().rig, full.observations())
     assert list(found.cameras) == ["cam0", "cam1", "cam2", "cam3"]
     for name, camera in found.cameras.items():
         lens = full.rig.cameras[name].intrinsics
@@ -55,7 +46,7 @@ def test_four_unknown_lenses_are_estimated_with_consistent_stds() -> None:
 
 def test_one_unknown_lens_beside_known_ones_is_estimated_precisely() -> None:
     full = simulate(71, 3, 30)
-    found = calibrate(without_lenses(full, "cam2").rig, full.observations())
+    found = calibrate(full.without_lenses("cam2").rig, full.observations())
     lens = full.rig.cameras["cam2"].intrinsics
     assert lens is not None
     camera = found.cameras["cam2"]
@@ -88,7 +79,7 @@ def test_an_undetermined_lens_is_refused_with_its_timing() -> None:
     # A small path in the middle of the images does not determine the focal length.
     small = Curve(full.paths["marker"].frequency, full.paths["marker"].phase, full.paths["marker"].amplitude * 0.15)
     full = simulate(73, 3, 15, path=small, noise=0.3)
-    session = without_lenses(full, "cam1", "cam2")
+    session = full.without_lenses("cam1", "cam2")
     status, document = solve(session)
     refused = document["metadata"]["refused"]
     assert status == 3
@@ -102,21 +93,9 @@ def solve(session: Session) -> tuple[int, dict[str, dict[str, dict[str, str]]]]:
 
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        write(session, place / "s")
+        session.write(place / "s")
         status = run(["calibrate", str(place / "s"), "--out", str(place / "out")])
         return status, json.loads((place / "out" / "result.json").read_text())
-
-
-def write(session: Session, folder: Path, metadata: str = "") -> None:
-    folder.mkdir()
-    text = metadata
-    for name, camera in session.rig.cameras.items():
-        text += f'[{name}]\nname = "{name}"\nsize = {list(camera.size)}\n'
-        if camera.intrinsics is not None:
-            text += f"matrix = {camera.intrinsics.matrix.tolist()}\n"
-            text += f"distortions = {camera.intrinsics.distortions.tolist()}\n"
-    (folder / "rig.toml").write_text(text)
-    write_observations(folder / "observations.csv", session.observations())
 
 
 def exact_pairs(seed: int, count: int) -> tuple[dict[str, RigCamera], dict[str, float], list[PairSolution]]:
@@ -204,7 +183,7 @@ def distances(found: Mapping[str, np.ndarray]) -> float:
 
 def test_a_scale_bar_of_known_length_gives_the_scale(tmp_path: Path) -> None:
     session = scale_bar_session(80, 0.4)
-    write(session, tmp_path / "s", '[metadata]\nunits = "cm"\nwand = [["a", "b", 40.0]]\n')
+    session.write(tmp_path / "s", 'units = "cm"\nwand = [["a", "b", 40.0]]')
     assert read_folder(tmp_path / "s")[0].scale_bars == (("a", "b", 40.0),)
     assert run(["calibrate", str(tmp_path / "s"), "--out", str(tmp_path / "out")]) == 0
     found = tomllib.loads((tmp_path / "out" / "calibration.toml").read_text())
@@ -217,7 +196,7 @@ def test_a_scale_bar_of_known_length_gives_the_scale(tmp_path: Path) -> None:
 
 def test_a_scale_bar_that_is_not_rigid_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     session = simulate(81, 3, 10, labels={"a": range(3), "b": range(3)})
-    write(session, tmp_path / "s", '[metadata]\nwand = [["a", "b", 0.4]]\n')
+    session.write(tmp_path / "s", 'wand = [["a", "b", 0.4]]')
     assert run(["calibrate", str(tmp_path / "s"), "--out", str(tmp_path / "out")]) == 3
     assert "scale bar (wand) a–b" in capsys.readouterr().err
 

@@ -12,9 +12,9 @@ from deploy.cli import run
 from hub.calibration.people.association import associate_people
 from protocols.geometry.pose import fit_similarity
 from protocols.session.calibration import read_calibration
-from protocols.session.folder import write_observations
 from protocols.session.observations import Observations
 from tests.bench.several_people import named
+from tests.support.rigs import write_session
 from tests.support.walking_people import THIGH, people_world
 
 Capture = pytest.CaptureFixture[str]
@@ -44,18 +44,10 @@ def test_names_that_agree_are_kept() -> None:
 
 def test_several_people_calibrate_the_cameras_in_metres_and_get_their_joints(tmp_path: Path, capsys: Capture) -> None:
     world = people_world(14, 2, (12.0, 15.0, 12.0))
-    session, out = tmp_path / "session", tmp_path / "out"
-    session.mkdir()
+    out = tmp_path / "out"
     seen = world.observations(SECONDS, seed=14)
     few = {key: track for key, track in seen.tracks.items() if key[1].partition(".")[2] in FEW}
-    write_observations(session / "observations.csv", Observations(few))
-    (session / "rig.toml").write_text(
-        "\n".join(
-            f'[{name}]\nname = "{name}"\nsize = [1280, 720]\nfps = {one.fps}\nmatrix = {one.lens.matrix.tolist()}\n'
-            f"distortions = {one.lens.distortions.tolist()}"
-            for name, one in world.cameras.items()
-        )
-    )
+    session = write_session(tmp_path / "session", world.rig(), Observations(few))
     height = f"{world.heights.mean():.3f}"
     assert run(["calibrate", str(session), "--height", height, "--out", str(out), "--json"]) == 0
     assert "people were associated" in "".join(json.loads(capsys.readouterr().out)["warnings"])

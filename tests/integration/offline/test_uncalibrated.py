@@ -17,16 +17,7 @@ from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
-from protocols.session.folder import write_observations
 from tests.support.rigs import Session, simulate
-
-
-def without_lenses(session: Session, *names: str) -> Session:
-    """The session without the intrinsics of ``names`` (their distortion stays in the pixels)."""
-    cameras = dict(session.rig.cameras)
-    for name in names:
-        cameras[name] = replace(cameras[name], intrinsics=None)
-    return replace(session, rig=replace(session.rig, cameras=cameras))
 
 
 def with_time_ratios(session: Session, ratios: Mapping[str, float]) -> Session:
@@ -42,24 +33,9 @@ def with_time_ratios(session: Session, ratios: Mapping[str, float]) -> Session:
     return replace(session, time=time, clocks=clocks)
 
 
-def write(session: Session, folder: Path) -> Path:
-    """The session as a folder."""
-    folder.mkdir()
-    tables = []
-    for name, camera in session.rig.cameras.items():
-        text = f'[{name}]\nname = "{name}"\nsize = {list(camera.size)}\nfps = {camera.fps}\n'
-        lens = camera.intrinsics
-        if lens is not None:
-            text += f"matrix = {lens.matrix.tolist()}\ndistortions = {lens.distortions.tolist()}\n"
-        tables.append(text)
-    (folder / "rig.toml").write_text("\n".join(tables))
-    write_observations(folder / "observations.csv", session.observations())
-    return folder
-
-
 def solve(session: Session, folder: Path) -> tuple[int, dict[str, Any]]:
     """Exit status of the command and its result.json."""
-    status = run(["calibrate", str(write(session, folder / "session")), "--out", str(folder / "out")])
+    status = run(["calibrate", str(session.write(folder / "session")), "--out", str(folder / "out")])
     return status, json.loads((folder / "out" / "result.json").read_text())
 
 
@@ -67,7 +43,7 @@ def true_lag(session: Session, a: str, b: str) -> float:
     """``t_a - t_b`` [s] in the middle of the common recording time."""
     spans = []
     for name in (a, b):
-        mine = session.time[[one == name for one in session.camera]]
+        mine = session.time[session.of_camera(name)]
         spans.append([session.true_time(name, float(t)) for t in (mine.min(), mine.max())])
     middle = 0.5 * (max(spans[0][0], spans[1][0]) + min(spans[0][1], spans[1][1]))
     return session.shown(a, middle) - session.shown(b, middle)
@@ -78,8 +54,7 @@ def epipolar_px(full: Session, session: Session, pair: dict[str, Any]) -> float:
     points = full.paths["marker"].at(np.linspace(3.0, 17.0, 80))
     seen: list[Floats] = []
     for name in pair["cameras"]:
-        lens = full.rig.cameras[name].intrinsics
-        assert lens is not None
+        lens = full.lens(name)
         local = full.poses[name].camera_from_world(points)
         straight = (local / local[:, 2:] @ lens.matrix.T)[:, :2]
         pixels = lens.project(local) if session.rig.cameras[name].intrinsics is None else straight
@@ -112,7 +87,7 @@ def test_a_camera_whose_lens_is_undetermined_is_timed_while_the_others_are_place
     free = simulate(0, 3, 5).paths["marker"]
     small = replace(free, amplitude=0.35 * free.amplitude)
     full = simulate(0, 3, 20, path=small, windows=[(0.0, 20.0), (0.0, 20.0), (4.0, 11.0)])
-    session = without_lenses(full, "cam2")
+    session = full.without_lenses("cam2")
     status, result = solve(session, tmp_path)
     assert status == 0
     assert list(result["cameras"]) == ["cam0", "cam1"]
@@ -131,7 +106,7 @@ def test_two_cameras_that_cannot_be_placed_are_refused_with_their_timing(
     uncalibrated: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     full = simulate(1, 2, 20)
-    session = without_lenses(full, *uncalibrated)
+    session = full.without_lenses(*uncalibrated)
     status, result = solve(session, tmp_path)
     assert status == 3
     assert "intrinsics" in capsys.readouterr().err
@@ -148,14 +123,14 @@ def test_two_cameras_that_cannot_be_placed_are_refused_with_their_timing(
 
 @pytest.mark.parametrize(("cameras", "permanent"), [(2, True), (3, False)])
 def test_a_refusal_lasts_only_where_more_rows_cannot_determine_the_lenses(cameras: int, permanent: bool) -> None:
-    session = without_lenses(simulate(2, cameras, 4), *(f"cam{n}" for n in range(cameras)))
+    session = simulate(2, cameras, 4).without_lenses()
     with pytest.raises(Refused) as caught:
         calibrate(session.rig, session.observations())
     assert caught.value.permanent == permanent
 
 
 def test_an_uncalibrated_camera_that_saw_another_object_is_not_timed(tmp_path: Path) -> None:
-    session = without_lenses(simulate(2, 3, 20, unrelated=(1,)), "cam1")
+    session = simulate(2, 3, 20, unrelated=(1,)).without_lenses("cam1")
     status, result = solve(session, tmp_path)
     assert status == 0
     assert "only its timing" not in result["metadata"]["refused"]["cam1"]
@@ -167,7 +142,7 @@ def test_an_uncalibrated_camera_that_saw_another_object_is_not_timed(tmp_path: P
 
 def test_a_refusal_of_the_rigs_control_points_reports_the_pairs(tmp_path: Path) -> None:
     session = simulate(3, 3, 15)
-    folder = write(session, tmp_path / "session")
+    folder = session.write(tmp_path / "session")
     distances = 'distances = [["cam0", "cam1", 1.0], ["cam0", "cam2", 1000.0]]'
     (folder / "rig.toml").write_text((folder / "rig.toml").read_text() + f"\n[metadata]\n{distances}\n")
     assert run(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 3
@@ -249,7 +224,7 @@ def test_two_cameras_with_the_same_wrong_rate_are_connected_as_a_group() -> None
 
 def test_a_camera_without_lens_and_with_a_wrong_rate_is_timed(tmp_path: Path) -> None:
     full = with_time_ratios(simulate(16, 3, 20), {"cam0": 0.8})
-    session = without_lenses(full, "cam0")
+    session = full.without_lenses("cam0")
     status, result = solve(session, tmp_path)
     assert status == 0
     check_pairs(full, session, result)
@@ -258,7 +233,7 @@ def test_a_camera_without_lens_and_with_a_wrong_rate_is_timed(tmp_path: Path) ->
 
 def test_a_wrong_rate_gives_a_warning_even_if_no_camera_can_be_placed(tmp_path: Path) -> None:
     full = with_time_ratios(simulate(17, 2, 20), {"cam1": 2.0})
-    status, result = solve(without_lenses(full, "cam0"), tmp_path)
+    status, result = solve(full.without_lenses("cam0"), tmp_path)
     assert status == 3
     assert any("its times run 2 times as fast" in text for text in result["warnings"])
     assert "its times run 2 times as fast" in (tmp_path / "out" / "report.html").read_text()
@@ -275,7 +250,7 @@ def test_a_wrong_rate_is_also_estimated_with_given_poses(tmp_path: Path) -> None
     first = simulate(18, 2, 15)
     assert solve(first, tmp_path)[0] == 0
     second = with_time_ratios(first, {"cam1": 1.2})
-    folder = write(second, tmp_path / "second")
+    folder = second.write(tmp_path / "second")
     known = tmp_path / "out" / "calibration.toml"
     assert run(["calibrate", str(folder), "--from-known", str(known), "--out", str(tmp_path / "again")]) == 0
     found = tomllib.loads((tmp_path / "again" / "calibration.toml").read_text())["cam1"]
@@ -284,8 +259,8 @@ def test_a_wrong_rate_is_also_estimated_with_given_poses(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("solver", ["paper"])
 def test_the_papers_solver_refuses_uncalibrated_cameras_by_name(solver: str, tmp_path: Path) -> None:
-    session = without_lenses(simulate(19, 2, 10), "cam1")
-    folder = write(session, tmp_path / "session")
+    session = simulate(19, 2, 10).without_lenses("cam1")
+    folder = session.write(tmp_path / "session")
     assert run(["calibrate", str(folder), "--solver", solver, "--out", str(tmp_path / "out")]) == 3
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert "no intrinsics" in result["metadata"]["refused"]["cam1"]

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import socket
-import threading
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -23,6 +20,8 @@ from tests.support.samples import eventually
 
 pytest.importorskip("cryptography", reason="the extra `keys` is not installed: access rules are not tested")
 from deploy.site.keys import issue, make_site
+from tests.support.links import poisoned, through_a_link
+from tests.support.threads import looping
 
 SITE = "test"
 
@@ -64,38 +63,13 @@ def test_a_name_in_use_twice_and_a_site_without_a_hub_are_warned_of() -> None:
         assert "runs 2 times" in agent.others(config, "lab", "hub").text
 
 
-def through_a_link(endpoint: str, change: Callable[[bytes], bytes]) -> str:
-    """A proxy to a router that changes what clients send; returns its own address."""
-    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
-    listening = socket.create_server(("127.0.0.1", 0))
-
-    def pump(source: socket.socket, sink: socket.socket, changed: Callable[[bytes], bytes]) -> None:
-        with suppress(OSError):
-            while data := source.recv(65_536):
-                sink.sendall(changed(data))
-        for end in (source, sink):
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def serve() -> None:
-        with suppress(OSError):
-            while True:
-                client, _ = listening.accept()
-                there = socket.create_connection((host, int(port)))
-                threading.Thread(target=pump, args=(client, there, change), daemon=True).start()
-                threading.Thread(target=pump, args=(there, client, bytes), daemon=True).start()
-
-    threading.Thread(target=serve, daemon=True).start()
-    return f"tcp/127.0.0.1:{listening.getsockname()[1]}"
-
-
 def test_a_live_router_that_does_not_route() -> None:
     """A declaration with a `?` ends all routing in Zenoh 1.10.2; the router still accepts connections."""
     endpoint = free_endpoint()
     config = BusConfig(mode="client", connect=(endpoint,))
     with Router(endpoint):
         assert agent.bus_path(config, SITE, "camera", "cam0").verdict == "ok"
-        hostile = through_a_link(endpoint, lambda data: data.replace(b"camQ", b"cam?"))
+        hostile = through_a_link(endpoint, poisoned)
         poison = open_session(BusConfig(mode="client", connect=(hostile,)), timeout_s=5.0)
         poison.declare_publisher("camQ/observation")
         found = agent.bus_path(config, SITE, "camera", "cam0")
@@ -183,19 +157,9 @@ def test_a_router_without_rules_is_detected(keys: tuple[Path, str]) -> None:
         assert (speaks.verdict, "publish for others" in speaks.text) == ("fail", True)
         assert "zenoh.json5" in speaks.remedy
 
-        enough = threading.Event()
-
-        def talk() -> None:
-            while not enough.wait(0.1):
-                publisher.put(pb.AgentStatus(schema_version=1, agent="hub", role="hub", boot_id="b", state="running"))
-
-        thread = threading.Thread(target=talk)
-        thread.start()
-        try:
+        speech = pb.AgentStatus(schema_version=1, agent="hub", role="hub", boot_id="b", state="running")
+        with looping(lambda: publisher.put(speech), 0.1):
             hears = agent.access_rights(camera, SITE, "camera", "cam0", seconds=3.0)
-        finally:
-            enough.set()
-            thread.join()
         assert (hears.verdict, "receives messages that it may not receive" in hears.text) == ("fail", True)
 
 

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import json
 import socket
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 pytest.importorskip("pymavlink", reason="the extra `uav` is not installed: DOCTOR IS NOT TESTED ON MAVLINK")
+from deploy.agents.processes import free_udp_port
 from deploy.config.uav import MavlinkConfig, UavConfig
 from deploy.site.doctor import autopilot
 from deploy.site.doctor.check_result import CheckResult
 from edge.mavlink.dialect import mavlink as M
 from edge.mavlink.link.signing import Signing
 from edge.mavlink.link.transport import Udp, Url
+from tests.support.threads import looping
 from tests.support.vehicle_link import autopilot as simulated_autopilot
 
 
@@ -30,29 +30,6 @@ def examine(url: str, patience_s: float = 0.5, **options: Any) -> list[CheckResu
 def examine_link(url: str) -> CheckResult:
     (found,) = examine(url)
     return found
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-@contextmanager
-def looping(step: object) -> Iterator[None]:
-    stop = threading.Event()
-
-    def run() -> None:
-        while not stop.wait(0.01):
-            step()  # type: ignore[operator]
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 def test_of_an_autopilot_that_does_not_forward_the_parameter_is_named() -> None:
@@ -83,7 +60,7 @@ def test_a_missing_serial_port_is_a_failure() -> None:
 
 
 def test_a_silent_link_is_a_failure() -> None:
-    found = examine_link(f"udpin:127.0.0.1:{free_port()}")
+    found = examine_link(f"udpin:127.0.0.1:{free_udp_port()}")
     assert (found.verdict, found.exit_status) == ("fail", 3)
     assert "TX to RX" in found.remedy
 
@@ -97,7 +74,7 @@ def test_a_port_held_by_the_agent_itself_is_a_failure() -> None:
 
 
 def test_garbage_is_reported_as_a_wrong_baud_rate() -> None:
-    port = free_port()
+    port = free_udp_port()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
 
         def send_garbage() -> None:

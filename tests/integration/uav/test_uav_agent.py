@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import socket
-import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 
 from deploy.agents import uav
+from deploy.agents.processes import free_udp_port
 from deploy.config.file import load
 from deploy.config.uav import SimulatedFlightConfig, UavConfig
 from edge.mavlink.roles.autopilot import DEFAULT_ORIGIN
@@ -26,15 +25,10 @@ from edge.uav.world.flight_world import FlightWorld
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.topics import TOPICS
 from tests.support.samples import eventually
+from tests.support.threads import running
 
 M = mavutil.mavlink
 ACTIVE, ERROR, COASTING = 1, 2, 8
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Gcs:
@@ -73,7 +67,7 @@ class Gcs:
 @contextmanager
 def agent(tmp_path: Path, text: str = "") -> Iterator[tuple[Gcs, FlightWorld, Any, UavConfig]]:
     """A running agent on a memory bus: station, world, subscriptions by topic, configuration."""
-    port = free_port()
+    port = free_udp_port()
     file = tmp_path / "drone.toml"
     file.write_text(
         f'id = "drone"\n[simulated]\nautopilot = "127.0.0.1:{port}"\nseconds = 60\nseed = 3\n'
@@ -84,17 +78,8 @@ def agent(tmp_path: Path, text: str = "") -> Iterator[tuple[Gcs, FlightWorld, An
     hub = MemoryHub()
     listener = MemoryBus(hub)
     subscriptions = {topic.name: listener.subscribe(topic) for topic in TOPICS}
-    stop = threading.Event()
-    thread = threading.Thread(target=uav.start_uav, args=(config, MemoryBus(hub), stop))
-    thread.start()
-    gcs = Gcs(port)
-    try:
+    with running(lambda stop: uav.start_uav(config, MemoryBus(hub), stop)), closing(Gcs(port)) as gcs:
         yield gcs, world, subscriptions, config
-    finally:
-        stop.set()
-        thread.join(20.0)
-        gcs.close()
-        assert not thread.is_alive()
 
 
 _WORLDS: dict[int, Any] = {}

@@ -9,17 +9,17 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from edge.scenes.common.placement import look_at_pose
 from protocols.core.clocks import TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from tests.bench import resection
 from tests.bench.resection import ErrorModel, Resection, resect
-from tests.support.solved_session import looking_at
 
 LENS = Intrinsics(1920, 1080, np.array([[1500.0, 0, 960], [0, 1500.0, 540], [0, 0, 1]]))
 NOMINAL = Intrinsics(1920, 1080, np.array([[1470.0, 0, 960], [0, 1470.0, 540], [0, 0, 1]]))
-POSE = looking_at(np.array([25.0, -20.0, 2.0]), np.array([0.0, 0.0, 3.0]))
+POSE = look_at_pose(np.array([25.0, -20.0, 2.0]), np.array([0.0, 0.0, 3.0]))
 CLOCK, GUESS = TimeMap(1 + 3e-4, 12.5), TimeMap(1.0, 12.3)
 STEP = 0.08
 TIME = np.arange(40.0, 120.0, STEP)

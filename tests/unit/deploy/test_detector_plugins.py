@@ -16,6 +16,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.detections import read_detections
 from protocols.validation.codec import SCHEMA_VERSION
 from protocols.validation.rules import check
+from tests.support.command_line import refusal
 from tests.support.networks import constant_model, write_network
 from tests.support.videos import write_video
 
@@ -78,10 +79,9 @@ def test_calibrate_refuses_what_is_no_detector(
         ("yolo.onnx", "there is no detector 'yolo.onnx'; give the .toml file that describes the network"),
         (str(tmp_path / "none.toml"), "this network's file does not exist"),
     ):
-        assert run(["calibrate", str(videos), "--detector", name, "--out", str(tmp_path / "out")]) == 2
-        error = capsys.readouterr().err
-        assert message in error
-        assert error.count("\n") == 1
+        assert message in refusal(
+            capsys, ["calibrate", str(videos), "--detector", name, "--out", str(tmp_path / "out")]
+        )
 
 
 def test_what_a_network_detects_is_a_valid_message_and_matches_predictions(tmp_path: Path) -> None:

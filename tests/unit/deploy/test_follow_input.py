@@ -15,10 +15,10 @@ import tomli_w
 from deploy.offline.follow.calibration import read_given_calibration
 from deploy.offline.follow.objects import followed_detections, object_messages, read_objects
 from deploy.offline.follow.source import FollowInput, read_follow_input
+from edge.scenes.common.placement import look_at_pose
 from protocols.core.errors import InputError, Refused
 from protocols.geometry.pose import POSE_CONVENTIONS, Pose
 from tests.support.crowds import NAMES, SIZE, boxes_csv, ends, poses, write_calibration
-from tests.support.rigs import looking_at
 
 SIZES = dict.fromkeys(NAMES, SIZE)
 _UP = np.diag([1.0, -1.0, -1.0])
@@ -222,7 +222,7 @@ def test_another_convention_of_poses_is_named(convention: str, up: str, tmp_path
     """They were followed as a few tracks of nobody, or refused as other units, clocks or cameras."""
     (tmp_path / "boxes.csv").write_text(boxes_csv(3.0), encoding="utf-8")
     tables = tomllib.loads(write_calibration(tmp_path / "calibration.toml").read_text(encoding="utf-8"))
-    turn = looking_at(np.zeros(3), np.array([3.0, 4.0, 1.0])).rotation  # else two of the conventions are one
+    turn = look_at_pose(np.zeros(3), np.array([3.0, 4.0, 1.0])).rotation  # else two of the conventions are one
     tables["metadata"]["up"] = turn.T[:, 2].tolist() if up == "given" else up
     if up == "left out":
         del tables["metadata"]["up"]

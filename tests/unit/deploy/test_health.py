@@ -14,6 +14,7 @@ from deploy.config.agents import HealthConfig
 from protocols.bus.base import Refusal
 from protocols.messages import syncline_pb2 as pb
 from protocols.validation.codec import RejectionReason
+from tests.support.receiving import http_get
 
 
 class Agent:
@@ -31,11 +32,7 @@ class Agent:
         self.health.seen(status)
 
     def get(self, path: str) -> tuple[int, str]:
-        try:
-            with urllib.request.urlopen(f"http://{self.server.address}/{path}", timeout=5.0) as answer:
-                return answer.status, answer.read().decode()
-        except urllib.error.HTTPError as error:
-            return error.code, error.read().decode()
+        return http_get(self.server.address, path)
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.cli import run
 from deploy.config.agents import CameraConfig, HubConfig
 from deploy.config.file import load
 from deploy.site.fleet import read_state
@@ -17,6 +16,7 @@ from edge import scenes
 from edge.scenes.common.rescaling import rescale_intrinsics, rescale_scene
 from protocols.core.errors import InputError
 from protocols.session.rig import read_rig
+from tests.support.command_line import refusal
 
 RIGS = sorted(path.name for path in SHIPPED.iterdir() if path.is_dir())
 
@@ -104,10 +104,7 @@ def test_no_rig_and_no_agents(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["fleet", "down", "--out", str(tmp_path)], "no fleet was started here"),
         (["fleet", "down", "webcams-room"], "takes only"),
     ):
-        assert run(arguments) == 2
-        error = capsys.readouterr().err
-        assert expected_text in error
-        assert error.count("\n") == 1
+        assert expected_text in refusal(capsys, arguments)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from protocols.bus.security.access import access_rules, certificate_name, certificate_owner
-from protocols.core.errors import EXIT_INPUT, InputError
+from protocols.core.errors import InputError
 from protocols.core.names import MAX_SEGMENT, check_name, is_name, key_segment, name_from_file, name_of_segment
+from tests.support.command_line import assert_reported
 
 
 @pytest.mark.parametrize(
@@ -61,15 +62,7 @@ def test_a_name_has_a_readable_key_segment_and_is_recovered_from_it(name: str, s
 )
 def test_a_bad_name_is_refused_in_one_line(name: str, word: str) -> None:
     assert not is_name(name)
-    with pytest.raises(InputError) as caught:
-        check_name(name, file=Path("rig.toml"), line=3)
-    assert caught.value.exit_status == EXIT_INPUT
-    message = str(caught.value)
-    assert message.startswith("rig.toml:3: camera name ")
-    assert word in message
-    assert caught.value.remedy in message
-    assert "\n" not in message
-    assert message.encode()  # it can be printed
+    assert_reported(lambda: check_name(name, file=Path("rig.toml"), line=3), Path("rig.toml"), 3, "camera name ", word)
     with pytest.raises(InputError):
         key_segment(name)
 

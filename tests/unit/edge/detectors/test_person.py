@@ -27,7 +27,8 @@ from edge.detectors.people.segmentation import segment_people
 from edge.detectors.people.silhouettes import IsolatedPeople
 from edge.scenes import renderer_for
 from protocols.geometry.types import Image
-from tests.support.people_boxes import score_boxes
+from tests.support.people_boxes import overlap, score_boxes
+from tests.unit.edge.detectors.test_person_templates import flat_ground
 
 HEIGHT, WIDTH = 240, 320
 
@@ -42,6 +43,14 @@ def street(seed: int = 0) -> Image:
 def wall() -> Image:
     """A smooth background without edges of its own."""
     return np.asarray(cv2.GaussianBlur(street(), (0, 0), 12.0), dtype=np.uint8)
+
+
+def silhouettes(*people: tuple[float, float, float]) -> npt.NDArray[np.uint8]:
+    """Mask (H, W) of people at (u, foot, height) [px]."""
+    drawn = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    for u, foot, tall in people:
+        draw_person(drawn, u, foot, tall, (255, 255, 255))
+    return np.where(drawn.any(axis=2), np.uint8(255), np.uint8(0)).astype(np.uint8)
 
 
 def noisy(picture: Image, rng: np.random.Generator, gain: float = 1.0) -> Image:
@@ -104,13 +113,8 @@ def test_no_person_is_detected_in_an_empty_street_under_changing_light() -> None
 
 
 def test_two_people_in_one_silhouette_are_segmented() -> None:
-    height_model = HeightModel(WIDTH, HEIGHT)
-    for index in range(60):
-        height_model.add(20.0 + 4 * index, 100.0 + index, 60.0)
-    foreground = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    draw_person(foreground, 100.0, 150.0, 60.0, (255, 255, 255))
-    draw_person(foreground, 114.0, 152.0, 60.0, (255, 255, 255))
-    mask = np.where(foreground.any(axis=2), np.uint8(255), np.uint8(0)).astype(np.uint8)
+    height_model = flat_ground()
+    mask = silhouettes((100.0, 150.0, 60.0), (114.0, 152.0, 60.0))
     shadow = np.zeros_like(mask)
     bodies = segment_people(mask, shadow, height_model, [])
     assert sorted(round(body.box[0] + 0.5 * body.box[2]) for body in bodies) == pytest.approx([100, 114], abs=4)
@@ -223,7 +227,7 @@ def test_two_people_in_a_rendered_room_are_localised_five_seconds_after_the_star
         if index < 50:
             continue
         boxes = [box for box in scene.boxes(camera.name, moment) if np.isfinite(box).all() and box[3] > 40]
-        hits = sum(any(_overlap(one.box, box) >= 0.5 for box in boxes) for one in found if one.box is not None)
+        hits = sum(any(overlap(one.box, box) >= 0.5 for box in boxes) for one in found if one.box is not None)
         right, wrong, missed = right + hits, wrong + len(found) - hits, missed + max(len(boxes) - hits, 0)
     assert right / (right + wrong) > 0.9
     assert right / (right + missed) > 0.9
@@ -249,16 +253,6 @@ def test_clothes_of_the_floors_colour_are_distinguished_from_shadows(shown: floa
     shadow, cloth = (slice(70, 170), slice(50, 110)), (slice(70, 170), slice(210, 270))
     assert (masks.shadow[shadow] > 0).mean() > 0.9
     assert (masks.foreground[cloth] > 0).mean() > 0.9
-
-
-def _overlap(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
-    x, y, w, h = np.asarray(a)
-    x2, y2, w2, h2 = np.asarray(b)
-    across = min(x + w, x2 + w2) - max(x, x2)
-    down = min(y + h, y2 + h2) - max(y, y2)
-    if across <= 0 or down <= 0:
-        return 0.0
-    return float(across * down / (w * h + w2 * h2 - across * down))
 
 
 def draw_car(picture: Image, u: float, v: float) -> None:
@@ -367,11 +361,7 @@ def test_a_person_who_leaves_the_initial_place_leaves_no_ghost() -> None:
 
 
 def test_fragments_of_a_person_do_not_update_the_height_model() -> None:
-    foreground = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    draw_person(foreground, 100.0, 150.0, 90.0, (255, 255, 255))
-    draw_person(foreground, 104.0, 176.0, 20.0, (255, 255, 255))
-    draw_person(foreground, 220.0, 176.0, 80.0, (255, 255, 255))
-    found = IsolatedPeople(np.where(foreground.any(axis=2), np.uint8(255), np.uint8(0)).astype(np.uint8)).find()
+    found = IsolatedPeople(silhouettes((100.0, 150.0, 90.0), (104.0, 176.0, 20.0), (220.0, 176.0, 80.0))).find()
     assert sorted(round(tall) for _, _, tall in found) == pytest.approx([80, 90], abs=2)
     height_model = HeightModel(WIDTH, HEIGHT)
     for index in range(30):
@@ -510,13 +500,8 @@ def test_tentative_heights_count_until_there_are_enough_observations() -> None:
 
 def test_a_short_person_beside_a_tall_one_has_a_short_box() -> None:
     """Both are one silhouette; neither is predicted, or both are, with heights measured when they were isolated."""
-    height_model = HeightModel(WIDTH, HEIGHT)
-    for index in range(60):
-        height_model.add(20.0 + 4 * index, 100.0 + index, 60.0)
-    drawn = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    draw_person(drawn, 100.0, 150.0, 66.0, (255, 255, 255))
-    draw_person(drawn, 116.0, 150.0, 48.0, (255, 255, 255))
-    foreground = np.where(drawn.any(axis=2), np.uint8(255), np.uint8(0)).astype(np.uint8)
+    height_model = flat_ground()
+    foreground = silhouettes((100.0, 150.0, 66.0), (116.0, 150.0, 48.0))
     nothing = np.zeros_like(foreground)
     usual = float(height_model.heights_at(np.array([108.0]), np.array([150.0]))[0])
     expected = [(89.0, 85.0, 22.0, 60.0), (105.0, 85.0, 22.0, 60.0)]

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
 
-import cv2
 import numpy as np
 import pytest
 
@@ -17,6 +13,7 @@ from edge.devices.base import Frame
 from edge.devices.live.network import NetworkCamera, StreamClock, open_network
 from edge.devices.live.opencv_capture import OpenCvCamera
 from protocols.core.errors import InputError
+from tests.support.mjpeg_camera import MjpegCamera
 from tests.support.rtsp_camera import RtspCamera
 
 pytest.importorskip("av", reason="the extra `video` is not installed: network streams are not tested")
@@ -78,28 +75,9 @@ def test_an_unplugged_camera_is_reconnected() -> None:
 
 @pytest.fixture
 def motion_jpeg() -> Iterator[str]:
-    class Stream(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-            self.end_headers()
-            rng = np.random.default_rng(0)
-            with suppress(OSError):
-                for _ in range(500):
-                    picture = cv2.imencode(".jpg", rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))[1].tobytes()
-                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
-                    self.wfile.write(head.encode() + picture + b"\r\n")
-                    time.sleep(0.02)
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Stream)
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}/video"
-    server.shutdown()
-    server.server_close()
+    camera = MjpegCamera(period_s=0.02)
+    yield camera.url
+    camera.unplug()
 
 
 def test_motion_jpeg_is_stamped_on_arrival_and_described_so(motion_jpeg: str) -> None:

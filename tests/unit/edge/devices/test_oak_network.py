@@ -22,6 +22,8 @@ from edge.devices.settings import OakSettings
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError
 from protocols.topics import OBSERVATION
+from tests.support.receiving import collect
+from tests.support.threads import running
 
 dai = pytest.importorskip("depthai", reason="the extra `oak` is not installed: the OAK driver is not tested")
 
@@ -180,18 +182,10 @@ def test_an_agent_publishes_the_boards_detections_and_runs_no_detector() -> None
     pictures = [picture(number, 100.0 + number / 50.0) for number in range(3)]
     found = [results(number, ("ball", 0.75, (300.0, 150.0, 600.0, 450.0))) for number in range(3)]
     camera = OakCamera(SETTINGS, prefix="cam4", connect=lambda settings: stream(pictures, found))
-    hub, stop = MemoryHub(), threading.Event()
+    hub = MemoryHub()
     subscription = MemoryBus(hub).subscribe(OBSERVATION)
-    agent = threading.Thread(target=CameraAgent(camera, UnusedDetector(), MemoryBus(hub), "cam4").run, args=(stop,))
-    agent.start()
-    messages: list[Any] = []
-    for _ in range(100):
-        subscription.wait(0.1)
-        messages += [received.message for received in subscription.drain()]
-        if len(messages) == 3:
-            break
-    stop.set()
-    agent.join(10.0)
+    with running(CameraAgent(camera, UnusedDetector(), MemoryBus(hub), "cam4").run):
+        messages: list[Any] = [received.message for received in collect(subscription, 3)]
     _KEPT[-1][0].stop()
     assert [(m.frame, len(m.detections)) for m in messages] == [(0, 1), (1, 1), (2, 1)]
     one = messages[0].detections[0]

@@ -34,9 +34,10 @@ from hub.bundle.problem import (
 )
 from hub.bundle.residuals import linearise, residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
-from hub.trajectory.splines import SplineBasis, fit_spline
+from hub.trajectory.splines import SplineBasis
 from protocols.geometry.types import Floats
 from protocols.session.calibration import AdjustmentStep
+from tests.support.bundles import pixels_of, spline_of
 from tests.support.rigs import random_lens, random_path, random_poses
 
 
@@ -52,13 +53,10 @@ def simulated_problem(
     ]
     paths, rows = [], []
     for label in range(labels):
-        basis = SplineBasis.covering(np.array([-1.0]), np.array([7.0]), 0.4)
-        grid = np.arange(-1, 7, 0.02)
-        control = fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid)))
-        paths.append(Trajectory(basis, control))
+        paths.append(spline_of(random_path(rng), -1.0, 7.0, 0.4))
         for camera, eye in enumerate(cameras):
             time = np.sort(rng.uniform(0.8, 5.2, 60))
-            seen = eye.intrinsics.project(eye.pose.camera_from_world(paths[label].at(eye.reference_time(time))))
+            seen = pixels_of(eye, paths[label], time)
             use = rng.random(60) > 0.1
             rows.append(TrackObservations(camera, label, time, seen + rng.normal(0, 0.5, seen.shape), use))
     problem = Problem(tuple(rows), tuple(lenses), 0, (0, 1), FreeParameters(lens=lens))

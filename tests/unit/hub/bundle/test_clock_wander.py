@@ -64,7 +64,7 @@ def test_correlated_errors_are_no_wander() -> None:
     session = rigs.simulate(41, 5, 40.0)
     random, pixels = np.random.default_rng(41), session.pixels.copy()
     for name in session.rig.cameras:
-        mine = np.flatnonzero([one == name for one in session.camera])
+        mine = np.flatnonzero(session.of_camera(name))
         white = random.normal(0.0, 0.7 * np.sqrt(1.0 - 0.97**2), (len(mine), 2))
         pixels[mine] += lfilter([1.0], [1.0, -0.97], white, axis=0)
     found = calibrate(session.rig, replace(session, pixels=pixels).observations())
@@ -86,7 +86,7 @@ def test_a_path_extrapolated_where_one_camera_sees_the_target_is_no_wander(seed:
 @pytest.mark.parametrize("slewed", ["cam0", "cam2"])
 def test_a_clock_that_is_slewed_live_is_followed_also_as_the_reference(slewed: str) -> None:
     session = rigs.simulate(60, 5, 45.0)
-    mine = np.array([name == slewed for name in session.camera])
+    mine = session.of_camera(slewed)
 
     def added(true: Floats) -> Floats:
         """What the service has added to the clock at true times."""

@@ -23,14 +23,12 @@ from hub.bundle.problem import (
     CameraState,
     CorrelatedNoise,
     Problem,
-    TrackObservations,
-    Trajectory,
 )
 from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
-from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
+from tests.support.bundles import observed, spline_of
 from tests.support.rigs import random_lens, random_path, random_poses
 
 SECONDS, RATE = 60.0, 15.0
@@ -63,17 +61,17 @@ def rig(seed: int, correlated_px: float = CORRELATED, focal_scale: float = 1.0) 
     rng = np.random.default_rng([seed, 4711])
     lenses, poses, middle = [random_lens(rng) for _ in range(CAMERAS)], random_poses(rng, CAMERAS), 0.5 * SECONDS
     cameras = tuple(CameraState(lens, pose, 1.0, middle, middle) for lens, pose in zip(lenses, poses, strict=True))
-    basis = SplineBasis.covering(np.array([-0.5]), np.array([SECONDS + 0.5]), 0.25)
-    grid = np.arange(-0.5, SECONDS + 0.5, 0.02)
-    path = Trajectory(basis, fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid))))
-    rows = []
-    for i, camera in enumerate(cameras):
-        time: Floats = np.asarray((np.arange(int(RATE * SECONDS)) + rng.uniform()) / RATE, dtype=np.float64)
-        seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(camera.reference_time(time))))
-        seen = seen + rng.normal(0.0, WHITE, seen.shape) + gauss_markov_errors(rng, time, correlated_px, TIME_CONSTANT)
-        rows.append(TrackObservations(i, 0, time, seen, np.ones(len(time), dtype=bool)))
-    nominal = tuple(zoomed(lens, focal_scale) for lens in lenses)
-    return Problem(tuple(rows), nominal, 0, (0, 1)), AdjustmentState(cameras, (path,), np.full(CAMERAS, 1.0))
+    path = spline_of(random_path(rng), -0.5, SECONDS + 0.5, 0.25)
+
+    def errors(time: Floats) -> Floats:
+        white = rng.normal(0.0, WHITE, (len(time), 2))
+        return white + gauss_markov_errors(rng, time, correlated_px, TIME_CONSTANT)
+
+    def times(_: int) -> Floats:
+        return np.asarray((np.arange(int(RATE * SECONDS)) + rng.uniform()) / RATE, dtype=np.float64)
+
+    problem, state = observed(cameras, path, times, errors, 1.0)
+    return replace(problem, nominal=tuple(zoomed(lens, focal_scale) for lens in lenses)), state
 
 
 def true_noise(correlated_px: float = CORRELATED) -> CorrelatedNoise:

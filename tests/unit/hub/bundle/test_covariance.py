@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from edge.scenes.common.placement import look_at_pose
 from hub.bundle import covariance as cov
 from hub.bundle.adjustment import adjust
 from hub.bundle.block_matrix import BlockSum, DenseCovariance
@@ -17,14 +18,12 @@ from hub.bundle.problem import (
     AdjustmentState,
     CameraState,
     Problem,
-    TrackObservations,
-    Trajectory,
 )
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.calibration.pipeline import calibrate
-from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
-from tests.support.rigs import looking_at, random_lens, random_path, random_poses, simulate
+from tests.support.bundles import observed, spline_of
+from tests.support.rigs import random_lens, random_path, random_poses, simulate
 from tests.unit.hub.bundle.test_adjustment import simulated_problem
 
 RUNS, SECONDS = 40, 12.0
@@ -53,16 +52,13 @@ def errors() -> Errors:
             CameraState(lens, pose, 1.0, rng.normal(0, 0.2) + SECONDS / 2, SECONDS / 2)
             for lens, pose in zip(lenses, random_poses(rng, 3), strict=True)
         )
-        basis = SplineBasis.covering(np.array([-1.0]), np.array([SECONDS + 1]), 0.25)
-        grid = np.arange(-1, SECONDS + 1, 0.02)
-        path = Trajectory(basis, fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid))))
-        rows = []
-        for i, camera in enumerate(cameras):
-            time = np.sort(rng.uniform(0, SECONDS, 300))
-            seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(camera.reference_time(time))))
-            rows.append(TrackObservations(i, 0, time, seen + rng.normal(0, 0.5, seen.shape), np.ones(300, dtype=bool)))
-        truth = AdjustmentState(cameras, (path,), np.full(3, 0.5))
-        problem = Problem(tuple(rows), tuple(lenses), 0, (0, 1))
+        path = spline_of(random_path(rng), -1.0, SECONDS + 1, 0.25)
+        problem, truth = observed(
+            cameras,
+            path,
+            lambda _, rng=rng: np.sort(rng.uniform(0, SECONDS, 300)),
+            lambda time, rng=rng: rng.normal(0, 0.5, (len(time), 2)),
+        )
         problem, state, prior = adjust(problem, truth, rounds=2, iterations=8)
         found = cov.covariance(problem, state, prior)
         for i in (1, 2):
@@ -97,15 +93,9 @@ def solved() -> tuple[Problem, AdjustmentState, SmoothnessPrior]:
     cameras = tuple(
         CameraState(lens, pose, 1.0, 3.0, 3.0) for lens, pose in zip(lenses, random_poses(rng, 3), strict=True)
     )
-    basis = SplineBasis.covering(np.array([0.0]), np.array([6.0]), 0.3)
-    grid = np.arange(0, 6, 0.02)
-    path = Trajectory(basis, fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid))))
-    rows = []
-    for i, camera in enumerate(cameras):
-        time = np.sort(rng.uniform(0, 6, 150))
-        seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(time)))
-        rows.append(TrackObservations(i, 0, time, seen + rng.normal(0, 0.5, seen.shape), np.ones(150, dtype=bool)))
-    return adjust(Problem(tuple(rows), tuple(lenses), 0, (0, 1)), AdjustmentState(cameras, (path,), np.full(3, 0.5)))
+    path = spline_of(random_path(rng), 0.0, 6.0, 0.3)
+    times, errors = lambda _: np.sort(rng.uniform(0, 6, 150)), lambda time: rng.normal(0, 0.5, (len(time), 2))
+    return adjust(*observed(cameras, path, times, errors))
 
 
 def test_parameters_fixed_by_the_gauge_have_no_variance(
@@ -201,19 +191,11 @@ def test_the_smoothness_of_a_path_does_not_hold_its_depth() -> None:
     lenses = [random_lens(rng) for _ in range(2)]
     places = (np.array([5.0, 0.0, 0.0]), np.array([5.0, 0.2, 0.0]))
     cameras = tuple(
-        CameraState(lens, looking_at(place, np.zeros(3)), 1.0, 10.0, 10.0)
+        CameraState(lens, look_at_pose(place, np.zeros(3)), 1.0, 10.0, 10.0)
         for lens, place in zip(lenses, places, strict=True)
     )
-    basis = SplineBasis.covering(np.array([0.0]), np.array([20.0]), 0.3)
-    grid = np.arange(0, 20, 0.02)
-    path = Trajectory(basis, fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid))))
-    rows = []
-    for i, camera in enumerate(cameras):
-        time = np.arange(0, 20, 0.035)
-        seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(time)))
-        rows.append(TrackObservations(i, 0, time, seen, np.ones(len(time), dtype=bool)))
-    problem = Problem(tuple(rows), tuple(lenses), 0, (0, 1))
-    state = AdjustmentState(cameras, (path,), np.full(2, 0.5))
+    path = spline_of(random_path(rng), 0.0, 20.0, 0.3)
+    problem, state = observed(cameras, path, lambda _: np.arange(0, 20, 0.035), lambda time: np.zeros((len(time), 2)))
     prior = estimate_smoothness(problem, state)
     with_prior, without = (
         cov.relative_rotation_stds(cov.covariance(problem, state, one), state)[1, 0]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import hub.calibration.final_adjustment
-from hub.bundle.problem import OFFSET, CameraState, TrackObservations, Trajectory
+from hub.bundle.problem import OFFSET, CameraState, TrackObservations
 from hub.bundle.residuals import linearise
 from hub.calibration.pipeline import calibrate
-from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.session.calibration import Calibration
 from tests.support import rigs
+from tests.support.bundles import pixels_of, spline_of
 
 SEED = 5120
 JITTERING = ("cam1", "cam2")
@@ -90,8 +90,7 @@ def test_correlated_errors_are_not_reported_as_jitter() -> None:
     time = session.time[mine]
     late = 0.02 * np.sin(2 * np.pi * (time - time[0]) / 1.5)
     label = session.label[int(np.flatnonzero(mine)[0])]
-    lens = session.rig.cameras["cam2"].intrinsics
-    assert lens is not None
+    lens = session.lens("cam2")
     moved = [
         lens.project(session.poses["cam2"].camera_from_world(session.truth_at(label, "cam2", at)))
         for at in (time, time + late)
@@ -105,10 +104,9 @@ def test_rows_with_jitter_have_its_covariance_along_their_motion() -> None:
     """Whitened residuals and Jacobians against the inverse of noise² (1 + (along² - 1) u uᵀ)."""
     rng = np.random.default_rng(SEED)
     camera = CameraState(rigs.random_lens(rng), rigs.random_poses(rng, 1)[0], 1.0, 5.0, 5.0)
-    basis, grid = SplineBasis.covering(np.array([0.0]), np.array([10.0]), 0.25), np.arange(0.0, 10.0, 0.02)
-    path = Trajectory(basis, fit_spline(basis, basis.weights(grid), rigs.random_path(rng).at(grid), np.ones(len(grid))))
+    path = spline_of(rigs.random_path(rng), 0.0, 10.0, 0.25)
     time = rng.uniform(0.5, 9.5, 40)
-    seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(camera.reference_time(time))))
+    seen = pixels_of(camera, path, time)
     rows = TrackObservations(0, 0, time, seen + rng.normal(0.0, 2.0, seen.shape), np.ones(40, dtype=np.bool_))
     along = rng.uniform(1.0, 9.0, 40)
     plain, white = linearise(rows, camera, path), linearise(replace(rows, along_std=along), camera, path)

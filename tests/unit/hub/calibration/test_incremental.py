@@ -22,7 +22,7 @@ from tests.support.rigs import Session, simulate
 
 def until(session: Session, true_s: float, **since: float) -> Observations:
     """The rows until a true time; of the named cameras only those since another."""
-    true = np.array([session.true_time(c, t) for c, t in zip(session.camera, session.time, strict=True)])
+    true = session.true
     begin = np.array([since.get(camera, -np.inf) for camera in session.camera])
     return session.observations(np.flatnonzero((true <= true_s) & (true >= begin)))
 
@@ -155,15 +155,7 @@ def test_a_moved_camera_is_found_again_where_it_stands(shift_m: float, turn_rad:
     moved = Pose(
         so3.exp(np.array([0.0, turn_rad, 0.0])) @ pose.rotation, pose.position + shift_m * np.array([0.6, 0.0, 0.8])
     )
-    lens = session.rig.cameras["cam2"].intrinsics
-    assert lens is not None
-    true = np.array([session.true_time(c, t) for c, t in zip(session.camera, session.time, strict=True)])
-    rows = np.array([c == "cam2" for c in session.camera]) & (true > 30.0)
-    path = session.paths["marker"].at(true[rows])
-    pixels = session.pixels.copy()
-    old, new = lens.project(pose.camera_from_world(path)), lens.project(moved.camera_from_world(path))
-    pixels[rows] += new - old
-    bumped = replace(session, pixels=pixels)
+    bumped = session.moved("cam2", 30.0, moved)
     last = update_calibration(session.rig, until(bumped, 29.0), None).calibration
     update = update_calibration(session.rig, until(bumped, 34.0), last, full=False)
     assert list(update.moved) == ["cam2"]
@@ -183,24 +175,12 @@ def test_a_moved_camera_is_found_again_where_it_stands(shift_m: float, turn_rad:
     assert abs(float(before.reference_from_camera(at)) - float(after.reference_from_camera(at))) < 3e-3
 
 
-def with_a_turn(session: Session, since: float, angle: float) -> Session:
-    """The session with cam1 turned about its vertical axis from a true time on [s, rad]."""
-    lens, pose = session.rig.cameras["cam1"].intrinsics, session.poses["cam1"]
-    assert lens is not None
-    turned = replace(pose, rotation=so3.exp(np.array([0.0, angle, 0.0])) @ pose.rotation)
-    true = np.array([session.true_time(c, t) for c, t in zip(session.camera, session.time, strict=True)])
-    rows = (np.array(session.camera) == "cam1") & (true > since)
-    path, pixels = session.paths["marker"].at(true[rows]), session.pixels.copy()
-    pixels[rows] += lens.project(turned.camera_from_world(path)) - lens.project(pose.camera_from_world(path))
-    return replace(session, pixels=pixels, poses={**session.poses, "cam1": turned})
-
-
 @pytest.mark.parametrize(("seed", "angle"), [(4, 0.09), (10, 0.09), (4, -0.03), (12, 0.3)])
 def test_a_move_of_one_of_two_cameras_is_named_and_the_rows_since_then_are_used(seed: int, angle: float) -> None:
     """It is no clock step, and the path does not follow both poses."""
     session = simulate(seed, 2, 40, windows=[(0, 40)] * 2)
     last = update_calibration(session.rig, until(session, 20.0), None).calibration
-    turned = with_a_turn(session, 20.0, angle)
+    turned = session.turned("cam1", 20.0, angle)
     update = update_calibration(session.rig, until(turned, 32.0), last, full=False)
     for name, time in update.moved.items():
         assert abs(turned.true_time(name, time) - 20.0) < 0.3
@@ -216,7 +196,9 @@ def test_a_move_of_one_of_two_cameras_is_named_and_the_rows_since_then_are_used(
 def test_a_move_of_one_of_two_cameras_is_no_clock_step_before_it_can_be_named(seed: int) -> None:
     session = simulate(seed, 2, 40, windows=[(0, 40)] * 2)
     last = update_calibration(session.rig, until(session, 20.0), None).calibration
-    found = update_calibration(session.rig, until(with_a_turn(session, 20.0, 0.09), 21.5), last, full=False).calibration
+    found = update_calibration(
+        session.rig, until(session.turned("cam1", 20.0, 0.09), 21.5), last, full=False
+    ).calibration
     assert not any(camera.clock_steps for camera in found.cameras.values())
     assert session.turn_error({name: camera.pose for name, camera in found.cameras.items()}) < 0.01
 
@@ -271,11 +253,11 @@ def test_arrival_priors_need_steady_delays() -> None:
 def test_a_clock_step_inside_the_window_is_recognised_and_the_map_is_that_after_it(camera: str, size: float) -> None:
     """It is no move of the camera, and the time that is published does not step with the reference camera's clock."""
     session = simulate(2, 3, 45)
-    mine = np.array([name == camera for name in session.camera])
+    mine = session.of_camera(camera)
     at = float(np.quantile(session.time[mine], 0.6))
     begin = session.true_time(camera, at)
     stepped = replace(session, time=session.time + np.where(mine & (session.time >= at), size, 0.0))
-    true = np.array([session.true_time(c, t) for c, t in zip(session.camera, session.time, strict=True)])
+    true = session.true
     last: Calibration | None = None
     for seconds in (begin - 3.0, begin + 3.0, begin + 6.0, 45.0):
         rows = stepped.observations(np.flatnonzero(true <= seconds))
@@ -297,7 +279,7 @@ def test_a_clock_step_inside_the_window_is_recognised_and_the_map_is_that_after_
 
 def test_the_first_answer_of_a_window_with_a_clock_step_holds_after_it() -> None:
     session = simulate(1, 4, 40)
-    mine = np.array([name == "cam2" for name in session.camera])
+    mine = session.of_camera("cam2")
     at = float(np.quantile(session.time[mine], 0.8))
     stepped = replace(session, time=session.time + np.where(mine & (session.time >= at), 0.03, 0.0))
     found = update_calibration(session.rig, stepped.observations(), None).calibration

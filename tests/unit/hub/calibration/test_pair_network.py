@@ -144,7 +144,7 @@ def test_a_camera_whose_search_has_failed_waits_until_a_path_may_spare_it_the_ne
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     session = simulate(3, 4, 20.0)
-    mine = np.array([name == "cam1" for name in session.camera])
+    mine = session.of_camera("cam1")
     pixels = session.pixels.copy()
     pixels[mine] = pixels[np.random.default_rng(0).permutation(np.flatnonzero(mine))]
     prepared = prepared_of(Session(**{**_fields(session), "pixels": pixels}))

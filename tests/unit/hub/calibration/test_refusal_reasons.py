@@ -16,7 +16,7 @@ from hub.calibration.pipeline import _no_pair_reason, calibrate
 from hub.calibration.triangulation import triangulate
 from hub.sync.pair_solver import _PairSearch, solve_pair
 from hub.sync.settings import PairSettings
-from hub.trajectory.image_tracks import SmoothTrack, smooth_track
+from hub.trajectory.image_tracks import SmoothTrack
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.session.calibration import FixedCalibration
@@ -38,31 +38,8 @@ def refusal_texts(session: rigs.Session, solver: str = "joint") -> str:
     return "\n".join([*found.refused.values(), *(pair.status for pair in found.pairs)])
 
 
-def with_rows(session: rigs.Session, keep: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> rigs.Session:
-    at = np.flatnonzero(keep)
-    return replace(
-        session,
-        camera=[session.camera[i] for i in at],
-        label=[session.label[i] for i in at],
-        frame=session.frame[at],
-        time=session.time[at],
-        pixels=session.pixels[at],
-    )
-
-
-def rows_of(session: rigs.Session, camera: str) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    return np.array([name == camera for name in session.camera])
-
-
-def tracks(session: rigs.Session) -> tuple[dict[str, SmoothTrack], dict[str, SmoothTrack]]:
-    out = []
-    for name in ("cam0", "cam1"):
-        lens, (track,) = session.rig.cameras[name].intrinsics, session.observations().of_camera(name)
-        assert lens is not None
-        found = smooth_track(track.time, lens.unproject(track.pixels), lens.focal, float(track.time[0]))
-        assert found is not None
-        out.append({"marker": found})
-    return out[0], out[1]
+def tracks(session: rigs.Session) -> list[dict[str, SmoothTrack]]:
+    return [session.smoothed(name) for name in ("cam0", "cam1")]
 
 
 def pair_status(settings: PairSettings) -> str:
@@ -136,8 +113,8 @@ def no_position(patch: pytest.MonkeyPatch) -> str:
 
 def too_short_track(_: pytest.MonkeyPatch) -> str:
     session = rigs.simulate(1, 3, SECONDS, late=0.5)
-    mine = rows_of(session, "cam2")
-    return refusal_texts(with_rows(session, ~mine | (np.cumsum(mine) <= 3)))
+    mine = session.of_camera("cam2")
+    return refusal_texts(session.where(~mine | (np.cumsum(mine) <= 3)))
 
 
 def unrelated_camera(_: pytest.MonkeyPatch) -> str:
@@ -156,7 +133,7 @@ def missing_intrinsics(_: pytest.MonkeyPatch) -> str:
 
 def no_observations(_: pytest.MonkeyPatch) -> str:
     session = rigs.simulate(1, 3, SECONDS, late=0.5)
-    return refusal_texts(with_rows(session, ~rows_of(session, "cam2")))
+    return refusal_texts(session.where(~session.of_camera("cam2")))
 
 
 def single_camera(_: pytest.MonkeyPatch) -> str:
@@ -165,7 +142,7 @@ def single_camera(_: pytest.MonkeyPatch) -> str:
 
 def only_one_with_observations(_: pytest.MonkeyPatch) -> str:
     session = rigs.simulate(1, 2, SECONDS, late=0.5)
-    return refusal_texts(with_rows(session, rows_of(session, "cam0")))
+    return refusal_texts(session.where(session.of_camera("cam0")))
 
 
 def no_common_instants(_: pytest.MonkeyPatch) -> str:

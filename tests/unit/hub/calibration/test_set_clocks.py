@@ -17,7 +17,7 @@ SECONDS = 30.0
 
 def with_clock_set(session: rigs.Session, camera: str, size: float, at: float = 0.4) -> Observations:
     """The session's observations with ``size`` [s] added to a camera's times from this share of its frames on."""
-    mine = np.array([name == camera for name in session.camera])
+    mine = session.of_camera(camera)
     late = session.frame >= np.quantile(session.frame[mine], at)
     time = session.time + np.where(mine & late, size, 0.0)
     return gather_tracks(session.camera, session.label, session.frame, time, session.pixels, np.full(len(time), np.nan))
@@ -37,7 +37,7 @@ def test_a_camera_whose_clock_was_set_is_calibrated_by_its_longest_part(size: fl
 def test_pauses_shuffled_rows_and_even_clocks_are_no_settings() -> None:
     session = rigs.simulate(42, 2, SECONDS)
     assert not set_clocks(["cam0", "cam1"], session.observations())
-    mine = np.array([name == "cam1" for name in session.camera])
+    mine = session.of_camera("cam1")
     shuffled = replace(session, time=session.time.copy())
     shuffled.time[mine] = np.random.default_rng(1).permutation(session.time[mine])
     assert not set_clocks(["cam1"], shuffled.observations())

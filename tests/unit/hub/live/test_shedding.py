@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import threading
 import time
 
 import pytest
@@ -18,6 +17,7 @@ from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION, STATUS
 from tests.support.samples import eventually, observation
+from tests.support.threads import running
 
 
 def test_predictions_go_first_then_smoothed_tracks_and_the_status_says_how_late() -> None:
@@ -56,9 +56,8 @@ def test_a_late_hub_is_degraded_on_the_page_until_it_has_caught_up(monkeypatch: 
     monkeypatch.setattr(agent, "_STATUS_S", 0.05)
     monkeypatch.setattr("hub.live.shedding._STATED_S", 0.3)
     monkeypatch.setattr(LiveHub, "state", lambda self, now: ("calibrated", ""))
-    late_s, stop, view = [5.0], threading.Event(), ViewState()
+    late_s, view = [5.0], ViewState()
     network = MemoryHub(clock_ns=lambda: time.time_ns() - round(late_s[0] * 1e9))
-    hub = threading.Thread(target=lambda: agent.run_hub(LiveHub(), MemoryBus(network), "hub", stop))
     with MemoryBus(network) as bus:
         statuses, camera = bus.subscribe(STATUS), bus.publisher(OBSERVATION, "cam0")
 
@@ -70,11 +69,7 @@ def test_a_late_hub_is_degraded_on_the_page_until_it_has_caught_up(monkeypatch: 
                 view.handle(received.message, 0.0)
             return any("behind its messages" in text for text in view.problems(0.0)) if view.of_role("hub") else None
 
-        hub.start()
-        try:
+        with running(lambda stop: agent.run_hub(LiveHub(), MemoryBus(network), "hub", stop)):
             assert eventually(lambda: says_it_is_late() is True)
             late_s[0] = 0.0
             assert eventually(lambda: says_it_is_late() is False)
-        finally:
-            stop.set()
-            hub.join(20.0)

@@ -32,7 +32,7 @@ from hub.bundle.problem import OFFSET, READOUT, CameraState, TrackObservations, 
 from hub.bundle.residuals import SplineSupport, StackedTrajectories, evaluate_points, jacobians
 from hub.sync.lag_scan import smallest_eigenvalues
 from hub.sync.pair_solver import solve_pair
-from hub.trajectory.image_tracks import neighbour_test, smooth_track
+from hub.trajectory.image_tracks import neighbour_test
 from hub.trajectory.splines import SplineBasis, fit_spline, weighted_sums
 from hub.two_view.relative_pose import homography_residual
 from protocols.geometry import kernels, so3
@@ -40,7 +40,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.validation.layouts import Layouts
-from tests.bench.pair_trials import FOCAL, MATRIX, Regime, make_trial
+from tests.bench.pair_trials import MATRIX, Regime, make_trial
 from tests.unit.protocols.test_layouts import NASTY_NUMBERS as NASTY
 from tests.unit.protocols.test_layouts import whole
 
@@ -214,10 +214,7 @@ def test_a_pair_has_the_same_solution(both: Both, calibrated: bool) -> None:
     trial = make_trial(Regime(dropped=0.2, outliers=0.05, gaps=2), 41)
 
     def solution() -> Floats:
-        tracks = [smooth_track(one.time, (one.pixels - MATRIX[:2, 2]) / FOCAL, FOCAL) for one in trial.views]
-        a, b = tracks
-        assert a is not None
-        assert b is not None
+        a, b = trial.smoothed()
         fit = solve_pair({"x": a, "y": a}, {"x": b, "y": b}, ("a", "b"), calibrated=calibrated).fit
         assert fit is not None
         return np.array([fit.offset, fit.rate, fit.residual_px, fit.lag_std, *fit.geometry.matrix.ravel()])

@@ -21,14 +21,7 @@ def test_lengths_of_transforms_are_those_that_scipy_takes() -> None:
 
 
 def smooth(session: Session) -> list[SmoothTrack]:
-    out = []
-    for name, camera in session.rig.cameras.items():
-        (track,) = session.observations().of_camera(name)
-        assert camera.intrinsics is not None
-        found = smooth_track(track.time, camera.intrinsics.unproject(track.pixels), camera.intrinsics.focal)
-        assert found is not None
-        out.append(found)
-    return out
+    return [session.smoothed(name)["marker"] for name in session.rig.cameras]
 
 
 def true_offset(session: Session, a: SmoothTrack, b: SmoothTrack) -> float:

@@ -11,9 +11,8 @@ from scipy.linalg import eigh
 from hub.sync import lts_scan
 from hub.sync.lag_scan import GridTrack, PairMoments, grid_tracks, to_grid_coordinates
 from hub.sync.lts_scan import LtsScan, scan_lags_lts
-from hub.trajectory.image_tracks import smooth_track
 from protocols.geometry.types import Floats
-from tests.bench.pair_trials import FOCAL, MATRIX, Regime, Trial, make_trial, unrelated_trial
+from tests.bench.pair_trials import Regime, Trial, make_trial, unrelated_trial
 
 STEP, SIGMA_PX = 0.033, 0.5
 TWO_OBJECTS = Regime(span=15, second_object=0.2, late=2)
@@ -27,9 +26,7 @@ def random_grid(seed: int, count: int, labels: int = 2) -> GridTrack:
 
 def of(trial: Trial) -> tuple[PairMoments, float]:
     """The moments of a trial and its true lag."""
-    a, b = (smooth_track(view.time, (view.pixels - MATRIX[:2, 2]) / FOCAL, FOCAL) for view in trial.views)
-    assert a is not None
-    assert b is not None
+    a, b = trial.smoothed()
     middle = np.array([np.mean(trial.overlap)])
     offset = float((trial.shown(0, middle) - a.time_origin - trial.shown(1, middle) + b.time_origin)[0])
     return PairMoments(*(grid_tracks([track], STEP, SIGMA_PX) for track in (a, b))), offset
@@ -38,7 +35,7 @@ def of(trial: Trial) -> tuple[PairMoments, float]:
 @cache
 def scanned(seed: int) -> tuple[PairMoments, float, LtsScan]:
     moments, offset = of(make_trial(TWO_OBJECTS, seed))
-    return moments, offset, scan_lags_lts(moments, SIGMA_PX, seed=0)
+    return moments, offset, scan_lags_lts(moments, SIGMA_PX)
 
 
 def test_bin_moments_are_direct_sums() -> None:
@@ -122,7 +119,7 @@ def test_the_estimated_geometry_is_that_of_the_marker(seed: int) -> None:
 
 def test_unrelated_tracks_have_less_inlier_time() -> None:
     moments, _ = of(unrelated_trial(make_trial(TWO_OBJECTS, 1), TWO_OBJECTS, 1))
-    scan = scan_lags_lts(moments, SIGMA_PX, seed=0)
+    scan = scan_lags_lts(moments, SIGMA_PX)
     inlier_seconds = scan.inlier_seconds[scan.inlier_seconds > 0]
     _, _, true = scanned(1)
     assert inlier_seconds.max() < 0.75 * true.inlier_seconds.max()
@@ -141,13 +138,13 @@ def test_inlier_time_does_not_exceed_the_overlap() -> None:
 
 def test_the_scan_is_deterministic_in_its_seed() -> None:
     moments, _, scan = scanned(0)
-    again = scan_lags_lts(moments, SIGMA_PX, seed=0)
+    again = scan_lags_lts(moments, SIGMA_PX)
     np.testing.assert_array_equal(scan.inlier_seconds, again.inlier_seconds)
     np.testing.assert_array_equal(scan.matrix, again.matrix)
 
 
 def test_short_tracks_have_no_inlier_time() -> None:
     moments = PairMoments(random_grid(1, 50), random_grid(2, 50))
-    scan = scan_lags_lts(moments, SIGMA_PX, seed=0)
+    scan = scan_lags_lts(moments, SIGMA_PX)
     assert (scan.inlier_seconds == 0).all()
     assert np.isinf(scan.misfit).all()

@@ -10,15 +10,9 @@ import pytest
 from hub.sync.lag_scan import GridTrack, PairMoments, grid_tracks, scan_lags
 from hub.sync.null_distribution import COST_FLOOR, NullDistribution, bandwidth, fit_null_distribution
 from hub.trajectory.image_tracks import SmoothTrack, smooth_track
-from tests.bench.pair_trials import FOCAL, MATRIX, Regime, Trial, make_trial, unrelated_trial
+from tests.bench.pair_trials import FOCAL, Regime, make_trial, unrelated_trial
 
 STEP, SIGMA_PX = 0.033, 0.5
-
-
-def smooth(trial: Trial) -> list[SmoothTrack]:
-    found = [smooth_track(view.time, (view.pixels - MATRIX[:2, 2]) / FOCAL, FOCAL) for view in trial.views]
-    assert all(track is not None for track in found)
-    return [track for track in found if track is not None]
 
 
 def grids(tracks: list[SmoothTrack]) -> list[GridTrack]:
@@ -34,7 +28,7 @@ def test_false_alarm_probabilities_of_unrelated_tracks_are_calibrated(regime: Re
     """Events of probability 0.1 or 0.01 are no more frequent than that."""
     values_found = []
     for seed in range(6):
-        tracks = smooth(unrelated_trial(make_trial(regime, seed), regime, seed))
+        tracks = unrelated_trial(make_trial(regime, seed), regime, seed).smoothed()
         moments = PairMoments(*grids(tracks))
         scan = scan_lags(moments, 1.0)
         width = min(bandwidth(track) for track in tracks)
@@ -59,7 +53,7 @@ def test_false_alarm_probabilities_of_unrelated_tracks_are_calibrated(regime: Re
 @pytest.mark.parametrize("seed", range(4))
 def test_the_true_alignment_has_a_tiny_false_alarm_probability(seed: int) -> None:
     trial = make_trial(Regime(late=1), seed)
-    a, b = smooth(trial)
+    a, b = trial.smoothed()
     moments = PairMoments(*grids([a, b]))
     scan = scan_lags(moments, 1.0)
     middle = np.array([np.mean(trial.overlap)])
@@ -112,14 +106,14 @@ def test_the_smallest_probabilities_are_continuous() -> None:
 
 
 def test_too_short_recordings_have_no_null_distribution() -> None:
-    moments = PairMoments(*grids(smooth(make_trial(Regime(span=4, late=0.2), 3))))
+    moments = PairMoments(*grids(make_trial(Regime(span=4, late=0.2), 3).smoothed()))
     assert fit_null_distribution(moments, scan_lags(moments, 1.0), 3.5, 0.0) is None
 
 
 def test_a_known_geometry_fits_by_chance_more_rarely() -> None:
     """Without free parameters unrelated stretches have a far larger misfit."""
     trial = make_trial(Regime(late=1), 2)
-    moments = PairMoments(*grids(smooth(trial)))
+    moments = PairMoments(*grids(trial.smoothed()))
     essential = trial.pose.essential.T
     free = fit_null_distribution(moments, scan_lags(moments, 1.0), 6.0, 0.0)
     fixed = fit_null_distribution(moments, scan_lags(moments, 1.0, essential), 6.0, 0.0, essential)

@@ -10,10 +10,8 @@ import pytest
 
 from hub.sync.hypothesis import PairSolution
 from hub.sync.pair_solver import solve_pair
-from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from hub.two_view.relative_pose import fundamental_from
 from tests.bench.pair_trials import (
-    FOCAL,
     MATRIX,
     Regime,
     Trial,
@@ -48,15 +46,9 @@ REGIMES = {
 }
 
 
-def smooth(trial: Trial) -> list[SmoothTrack]:
-    found = [smooth_track(view.time, (view.pixels - MATRIX[:2, 2]) / FOCAL, FOCAL) for view in trial.views]
-    assert all(track is not None for track in found)
-    return [track for track in found if track is not None]
-
-
 def solve(trial: Trial, regime: Regime, calibrated: bool = True) -> PairSolution:
     """The pair solution, with the expensive searches where the regime needs them."""
-    a, b = smooth(trial)
+    a, b = trial.smoothed()
     thorough = regime.assumed_fps is not None or regime.second_object > 0 or regime.ppm > 1000
     return solve_pair({"": a}, {"": b}, ("a", "b"), calibrated=calibrated, thorough=thorough)
 
@@ -132,7 +124,7 @@ def test_lag_errors_are_near_the_cramer_rao_bound() -> None:
 
 
 def test_a_wrong_frame_rate_is_found_only_by_the_thorough_search() -> None:
-    a, b = smooth(make_trial(ASSUMED_30, 1))
+    a, b = make_trial(ASSUMED_30, 1).smoothed()
     plain = solve_pair({"": a}, {"": b}, ("a", "b"))
     assert not plain.solved
     found = solve_pair({"": a}, {"": b}, ("a", "b"), thorough=True)
@@ -142,7 +134,7 @@ def test_a_wrong_frame_rate_is_found_only_by_the_thorough_search() -> None:
 
 def test_a_wrong_frame_rate_of_the_first_camera_gives_the_inverse_rate() -> None:
     trial = make_trial(ASSUMED_30, 3)
-    a, b = smooth(trial)
+    a, b = trial.smoothed()
     forward = solve_pair({"": a}, {"": b}, ("a", "b"), thorough=True)
     backward = solve_pair({"": b}, {"": a}, ("b", "a"), thorough=True)
     assert forward.fit is not None
@@ -160,7 +152,7 @@ def test_the_lag_std_is_calibrated() -> None:
     over = []
     for seed in range(200, 212):
         trial = make_trial(USUAL, seed)
-        a, b = smooth(trial)
+        a, b = trial.smoothed()
         found = solve_pair({"": a}, {"": b}, ("a", "b"))
         assert found.fit is not None
         assert 0.5 < found.fit.lag_std / lag_bound(trial, True) < 2.0
@@ -171,7 +163,7 @@ def test_the_lag_std_is_calibrated() -> None:
 
 
 def test_without_intrinsics_there_is_no_pose() -> None:
-    a, b = smooth(make_trial(USUAL, 4))
+    a, b = make_trial(USUAL, 4).smoothed()
     found = solve_pair({"": a}, {"": b}, ("a", "b"), calibrated=False)
     assert found.fit is not None
     with pytest.raises(ValueError, match="intrinsics"):

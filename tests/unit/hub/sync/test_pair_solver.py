@@ -8,24 +8,14 @@ import pytest
 from hub.calibration.pipeline import calibrate
 from hub.sync.hypothesis import PairSolution
 from hub.sync.pair_solver import solve_pair
-from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from tests.bench.honesty import regular
 from tests.support.rigs import Path, Session, random_path, simulate
 
 
-def tracks(session: Session, name: str) -> dict[str, SmoothTrack]:
-    lens = session.rig.cameras[name].intrinsics
-    assert lens is not None
-    own = session.observations().of_camera(name)
-    epoch = min(float(track.time[0]) for track in own)
-    found = {t.label: smooth_track(t.time, lens.unproject(t.pixels), lens.focal, epoch) for t in own}
-    return {label: track for label, track in found.items() if track is not None}
-
-
 def solve(session: Session, a: str = "cam0", b: str = "cam1") -> PairSolution:
-    return solve_pair(tracks(session, a), tracks(session, b), (a, b))
+    return solve_pair(session.smoothed(a), session.smoothed(b), (a, b))
 
 
 def lag_error(session: Session, found: PairSolution) -> float:

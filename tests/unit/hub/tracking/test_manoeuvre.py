@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge.scenes.common.placement import look_at_pose
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter import kalman
 from hub.tracking.filter.kalman import STATE_DIM
@@ -26,7 +27,6 @@ from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
-from tests.support.rigs import looking_at
 
 LENS = Intrinsics(640, 480, np.array([[450.0, 0, 319.5], [0, 450.0, 239.5], [0, 0, 1.0]]))
 FPS, SECONDS, CAMERAS, TURN_S = 10.0, 3.0, 5, 1.51
@@ -51,7 +51,7 @@ def followed(path: Path) -> tuple[list[tuple[float, float]], int]:
     for i in range(CAMERAS):
         angle = 2 * np.pi * i / CAMERAS
         place = np.array([5.0 * np.cos(angle), 5.0 * np.sin(angle), 2.0])
-        camera = TrackingCamera(f"cam{i}", LENS, looking_at(place, np.array([0.0, 0.0, 1.0])), TimeMap(), 1e-4)
+        camera = TrackingCamera(f"cam{i}", LENS, look_at_pose(place, np.array([0.0, 0.0, 1.0])), TimeMap(), 1e-4)
         cameras[camera.name] = camera
         frames += [((number + i / CAMERAS) / FPS, number, camera) for number in range(int(SECONDS * FPS))]
     tracker = Tracker(TrackerParameters(up=np.array([0.0, 0.0, 1.0])))

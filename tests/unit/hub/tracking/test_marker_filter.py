@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from edge.scenes.common.placement import look_at_pose
 from hub.tracking.association.triangulation import initial_motion
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.jerk_model import STATE_DIM, jerk_model, rts_smooth
@@ -13,7 +14,7 @@ from hub.tracking.marker_filter import MarkerState, process_row
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
-from tests.support.rigs import SIZE, looking_at, random_lens, random_poses
+from tests.support.rigs import SIZE, random_lens, random_poses
 
 PSD = 3e-4
 COAST_NS = 10 * NANOSECONDS
@@ -142,10 +143,10 @@ def test_three_rows_of_two_cameras_begin_a_track_and_mismatched_ones_do_not() ->
 
 def test_a_depth_that_was_lost_is_found_again() -> None:
     """After metres of drift along one camera's ray, the second camera's rows need more than one linearisation."""
-    pose = looking_at(np.array([0.0, -50.0, 0.0]), np.zeros(3))
+    pose = look_at_pose(np.array([0.0, -50.0, 0.0]), np.zeros(3))
     lens = random_lens(np.random.default_rng(3))
     far = TrackingCamera("far", lens, pose, TimeMap())
-    near = TrackingCamera("near", lens, looking_at(np.array([13.0, 3.0, 0.0]), np.zeros(3)), TimeMap())
+    near = TrackingCamera("near", lens, look_at_pose(np.array([13.0, 3.0, 0.0]), np.zeros(3)), TimeMap())
     ray = np.array([0.0, 1.0, 0.0])
     spread = 1e-4 * np.eye(STATE_DIM)
     spread[:3, :3] += 36.0 * np.outer(ray, ray)

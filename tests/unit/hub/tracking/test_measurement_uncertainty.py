@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from edge.scenes.common.placement import look_at_pose
 from hub.tracking.association.assignment import (
     COLOUR_STD,
     matching_colour_std,
@@ -28,7 +29,6 @@ from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
-from tests.support.rigs import looking_at
 
 UP = np.array([0.0, 0.0, 1.0])
 TALL = 1.7
@@ -41,7 +41,7 @@ def ring(count: int) -> dict[str, TrackingCamera]:
     for i in range(count):
         angle = 2 * np.pi * i / count + 0.3
         place = np.array([4.5 * np.cos(angle), 4.5 * np.sin(angle), 2.3])
-        out[f"cam{i}"] = TrackingCamera(f"cam{i}", LENS, looking_at(place, 0.9 * UP), TimeMap(), 1e-4)
+        out[f"cam{i}"] = TrackingCamera(f"cam{i}", LENS, look_at_pose(place, 0.9 * UP), TimeMap(), 1e-4)
     return out
 
 
@@ -63,7 +63,7 @@ def test_a_box_in_a_rolled_camera_gives_head_and_foot_where_the_body_has_them() 
     """Also beside the picture's middle, and whatever the lens does to straight lines."""
     curved = replace(LENS, distortions=np.array([-0.2, 0.05, 0.0, 0.0, 0.0]))
     for roll, lens in itertools.product((0.0, 0.15, -0.6), (LENS, curved)):
-        pose = looking_at(np.array([4.0, 1.0, 2.6]), 0.9 * UP)
+        pose = look_at_pose(np.array([4.0, 1.0, 2.6]), 0.9 * UP)
         pose = replace(pose, rotation=so3.exp(roll * UP) @ pose.rotation, position=pose.position)
         camera = TrackingCamera("cam", lens, pose, TimeMap())
         message = pb.Observation(schema_version=1, camera="cam", boot_id="b")

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.evaluation.clear_mot import EvaluationFrame, MotScores, clear_mot
+from edge.scenes.common.placement import look_at_pose
 from hub.tracking import offline
 from hub.tracking.association.continuation import EntryExitRates
 from hub.tracking.association.initiation import LengthScale
@@ -32,7 +33,6 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, CameraCalibration
-from tests.support.rigs import looking_at
 
 UP = np.array([0.0, 0.0, 1.0])
 LENS = Intrinsics(1280, 720, np.array([[900.0, 0, 639.5], [0, 900.0, 359.5], [0, 0, 1.0]]))
@@ -63,7 +63,7 @@ def crowd(
     messages, cameras = [], {}
     for index in range(CAMERAS):
         name, angle = f"cam{index}", 2.0 * np.pi * index / CAMERAS + 0.2
-        pose = looking_at(np.array([11.0 * np.cos(angle), 11.0 * np.sin(angle), 2.2 + 0.5 * index]), 0.9 * UP)
+        pose = look_at_pose(np.array([11.0 * np.cos(angle), 11.0 * np.sin(angle), 2.2 + 0.5 * index]), 0.9 * UP)
         given_pose = Pose(so3.exp(rng.normal(0.0, turn, 3)) @ pose.rotation, pose.position)
         clock = 1000.0 * index
         lag = lag_s * index / CAMERAS
@@ -318,7 +318,7 @@ def boxes(
     messages, known = [], {}
     for index in range(cameras):
         name, angle = f"cam{index}", 2.0 * np.pi * index / cameras + 0.2
-        pose = looking_at(np.array([11.0 * np.cos(angle), 11.0 * np.sin(angle), height]), 0.9 * UP)
+        pose = look_at_pose(np.array([11.0 * np.cos(angle), 11.0 * np.sin(angle), height]), 0.9 * UP)
         known[name] = CameraCalibration(name, LENS, pose, TimeMap(1.0, 0.0), 1e-3, np.zeros(3), 1.0)
         for frame, here in enumerate(place):
             foot = np.column_stack([here, np.zeros(len(here))])

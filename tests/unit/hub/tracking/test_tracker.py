@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from edge import scenes
+from edge.scenes.common.placement import look_at_pose
 from hub.tracking.association.initiation import LengthScale
 from hub.tracking.calibration.vertical import VerticalEstimator
 from hub.tracking.detections import TrackingCamera, frame_detections
@@ -24,7 +25,6 @@ from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration
 from tests.support.people_traffic import Faults, Traffic, cameras_of, film
-from tests.support.rigs import looking_at
 
 UP = np.array([0.0, 0.0, 1.0])
 LENS = Intrinsics(640, 480, np.array([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1.0]]))
@@ -36,7 +36,7 @@ def ring(count: int, scale: float = 1.0) -> dict[str, TrackingCamera]:
     for i in range(count):
         angle = 2 * np.pi * i / count + 0.3
         place = np.array([4.0 * np.cos(angle), 4.0 * np.sin(angle), 2.0])
-        pose = looking_at(place, np.array([0.0, 0.0, 1.0]))
+        pose = look_at_pose(place, np.array([0.0, 0.0, 1.0]))
         name = f"cam{i}"
         out[name] = TrackingCamera(name, LENS, Pose(pose.rotation, scale * pose.position), TimeMap(1.0, -3.0 * i), 1e-4)
     return out

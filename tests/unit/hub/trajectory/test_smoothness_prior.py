@@ -9,10 +9,10 @@ import pytest
 
 from hub.bundle.adjustment import adjust
 from hub.bundle.covariance import equivalent_std
-from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations, Trajectory
+from hub.bundle.problem import AdjustmentState, CameraState, Problem, Trajectory
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness, smoothness_terms
-from hub.trajectory.splines import SplineBasis, fit_spline
 from protocols.geometry.types import Floats
+from tests.support.bundles import observed, spline_of
 from tests.support.rigs import random_lens, random_path, random_poses
 
 SECONDS = 12.0
@@ -25,15 +25,14 @@ def two_cameras(seed: int, until: float = SECONDS, noise: float = 0.5) -> tuple[
     middle = 0.5 * SECONDS
     poses = random_poses(rng, 2)
     cameras = tuple(CameraState(lens, pose, 1.0, middle, middle) for lens, pose in zip(lenses, poses, strict=True))
-    basis = SplineBasis.covering(np.array([-0.5]), np.array([SECONDS + 0.5]), 0.25)
-    grid = np.arange(-0.5, SECONDS + 0.5, 0.02)
-    path = Trajectory(basis, fit_spline(basis, basis.weights(grid), random_path(rng).at(grid), np.ones(len(grid))))
-    rows = []
-    for i, camera in enumerate(cameras):
-        time = np.sort(rng.uniform(0, until if i else SECONDS, 300))
-        seen = camera.intrinsics.project(camera.pose.camera_from_world(path.at(camera.reference_time(time))))
-        rows.append(TrackObservations(i, 0, time, seen + rng.normal(0, noise, seen.shape), np.ones(300, dtype=bool)))
-    return Problem(tuple(rows), tuple(lenses), 0, (0, 1)), AdjustmentState(cameras, (path,), np.full(2, noise))
+    path = spline_of(random_path(rng), -0.5, SECONDS + 0.5, 0.25)
+    return observed(
+        cameras,
+        path,
+        lambda i: np.sort(rng.uniform(0, until if i else SECONDS, 300)),
+        lambda time: rng.normal(0, noise, (len(time), 2)),
+        noise,
+    )
 
 
 def value(path: Trajectory, prior: SmoothnessPrior, control: Floats) -> float:

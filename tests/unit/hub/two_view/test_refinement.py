@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from edge.scenes.common.placement import look_at_pose
 from hub.two_view import relative_pose as two_view
 from hub.two_view.refinement import FINAL_WIDTH, SEARCH_WIDTH, NoiseModel, PointPairs, RefinementResult, refine
 from hub.two_view.relative_pose import FundamentalMatrix, RelativePose, TwoViewGeometry, relative_pose_between
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
-from tests.support.rigs import looking_at, random_path
+from tests.support.rigs import random_path
 
 SIGMA = 5e-4
 LAG, DRIFT = 0.35, 1.0 + 3e-4
@@ -27,8 +28,8 @@ class Pair:
         rng = np.random.default_rng(seed)
         angle = rng.uniform(0.6, 2.4)
         self.poses = (
-            looking_at(np.array([5.0, 0.0, 1.0]), rng.normal(0, 0.1, 3)),
-            looking_at(np.array([5 * np.cos(angle), 5 * np.sin(angle), rng.uniform(-0.5, 2)]), rng.normal(0, 0.1, 3)),
+            look_at_pose(np.array([5.0, 0.0, 1.0]), rng.normal(0, 0.1, 3)),
+            look_at_pose(np.array([5 * np.cos(angle), 5 * np.sin(angle), rng.uniform(-0.5, 2)]), rng.normal(0, 0.1, 3)),
         )
         self.path = random_path(rng)
         self.pose = relative_pose_between(*self.poses)

@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from edge.scenes.common.placement import look_at_pose
 from hub.two_view import relative_pose
 from hub.two_view.relative_pose import FundamentalMatrix, RelativePose, TwoViewGeometry
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
-from tests.support.rigs import looking_at
 
 
 def scene(seed: int, count: int = 60) -> tuple[RelativePose, Floats, Floats, float, Floats]:
     """Relative pose, normalised points of a and b, the baseline, and the points in a's axes."""
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0.5, 2.6)
-    a = looking_at(np.array([5.0, 0.0, rng.uniform(-1, 1)]), rng.normal(0, 0.1, 3))
-    b = looking_at(np.array([4 * np.cos(angle), 4 * np.sin(angle), rng.uniform(-1, 1)]), np.zeros(3))
+    a = look_at_pose(np.array([5.0, 0.0, rng.uniform(-1, 1)]), rng.normal(0, 0.1, 3))
+    b = look_at_pose(np.array([4 * np.cos(angle), 4 * np.sin(angle), rng.uniform(-1, 1)]), np.zeros(3))
     points = rng.uniform(-1, 1, (count, 3))
     turn = b.rotation @ a.rotation.T
     shift = b.rotation @ (a.position - b.position)

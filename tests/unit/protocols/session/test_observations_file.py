@@ -9,8 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from protocols.core.errors import EXIT_INPUT, InputError
+from protocols.core.errors import InputError
 from protocols.session.observations import DEFAULT_LABEL, Observations, read_observations
+from tests.support import command_line
 
 HEAD = "camera,frame,time,u,v\n"
 ROWS = "a,0,10.0,1.5,2.5\na,1,10.1,3,4\nb,0,1.7e9,5,6\n"
@@ -23,17 +24,7 @@ def read(tmp_path: Path, text: str | bytes) -> Observations:
 
 
 def assert_reported(tmp_path: Path, text: str | bytes, line: int | None, *words: str) -> None:
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, text)
-    error, message = caught.value, str(caught.value)
-    assert error.exit_status == EXIT_INPUT
-    file = tmp_path / "observations.csv"
-    assert message.startswith(f"{file}:" if line is None else f"{file}:{line}: "), message
-    assert error.remedy
-    assert error.remedy in message
-    assert "\n" not in message
-    for word in words:
-        assert word in message, message
+    command_line.assert_reported(lambda: read(tmp_path, text), tmp_path / "observations.csv", line, *words)
 
 
 def same(one: Observations, other: Observations) -> bool:
@@ -141,7 +132,7 @@ def test_not_utf8_is_reported(tmp_path: Path) -> None:
 
 
 def test_an_empty_file_is_reported(tmp_path: Path) -> None:
-    assert_reported(tmp_path, "", 1, "column")
+    assert_reported(tmp_path, "", 1, "empty")
 
 
 def test_a_header_alone_is_reported(tmp_path: Path) -> None:
@@ -199,8 +190,9 @@ def test_a_bad_size_is_reported(tmp_path: Path, size: str, word: str) -> None:
     assert_reported(tmp_path, f"camera,frame,time,u,v,size\na,0,0,1,2,3\na,1,1,1,2,{size}\n", 3, word)
 
 
-def test_a_row_cut_before_its_label_is_reported(tmp_path: Path) -> None:
-    assert_reported(tmp_path, "camera,frame,time,u,v,label\na,0,0,1,2,x\na,1,1,1,2\n", 3, "columns")
+@pytest.mark.parametrize(("further", "cells"), [("label", "x"), ("cov_uu,cov_vv", "1,1")])
+def test_a_row_cut_before_a_column_is_reported(tmp_path: Path, further: str, cells: str) -> None:
+    assert_reported(tmp_path, f"camera,frame,time,u,v,{further}\na,0,0,1,2,{cells}\na,1,1,1,2\n", 3, "columns")
 
 
 def test_two_rows_of_one_frame_are_reported(tmp_path: Path) -> None:

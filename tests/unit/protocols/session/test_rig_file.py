@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from protocols.core.errors import EXIT_INPUT, InputError
+from protocols.core.errors import InputError
 from protocols.geometry import so3
 from protocols.session.rig import Rig, misspelt_keys, read_rig
+from tests.support import command_line
 
 LENS = "matrix = [[900.0, 0, 640.0], [0, 901.0, 360.0], [0, 0, 1]]\ndistortions = [0.1, 0, 0, 0, 0]\n"
 CAM0 = f'[cam0]\nname = "cam0"\nsize = [1280, 720]\nfps = 30\n{LENS}'
@@ -23,18 +24,7 @@ def read(tmp_path: Path, text: str | bytes) -> Rig:
 
 
 def assert_reported(tmp_path: Path, text: str | bytes, line: int | None, *words: str) -> None:
-    """The error names file, line, what and a remedy, in one line, with exit status 2."""
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, text)
-    error, message = caught.value, str(caught.value)
-    assert error.exit_status == EXIT_INPUT
-    place = f"{tmp_path / 'rig.toml'}:" if line is None else f"{tmp_path / 'rig.toml'}:{line}: "
-    assert message.startswith(place), message
-    assert "\n" not in message
-    assert error.remedy
-    assert error.remedy in message
-    for word in words:
-        assert word in message, message
+    command_line.assert_reported(lambda: read(tmp_path, text), tmp_path / "rig.toml", line, *words)
 
 
 @pytest.mark.parametrize(
