@@ -32,7 +32,7 @@ from protocols.core.errors import InputError, Refused
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import LONG_FILM_S, SessionBuilder
-from protocols.session.calibration import Calibration, CameraCalibration, stated_calibration
+from protocols.session.calibration import Calibration, CameraCalibration, stated_calibration, stated_up
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -604,10 +604,12 @@ class LiveHub:
         self.track_with(self.calibration, rig, {})
 
     def track_with(self, calibration: Calibration, rig: Rig | None, boot_ids: dict[str, str]) -> None:
-        """Pass a new calibration to tracking. With ``up`` in the rig, the world's z axis is up."""
+        """Pass a new calibration to tracking. With ``up`` in the rig, a solved world's z axis is up."""
         self._tracked_with = calibration, rig, boot_ids
         if self.tracking is not None:
             up = None if rig is None or rig.up is None else np.array([0.0, 0.0, 1.0])
+            if self._known is not None:
+                up = stated_up(self._known.rig, self._known.cameras)
             self.tracking.calibrate(
                 calibration.cameras,
                 boot_ids,

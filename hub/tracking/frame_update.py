@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from hub.tracking.association.assignment import (
     occlusions,
     update_colour_variance,
 )
+from hub.tracking.association.encounters import resolve_encounters
 from hub.tracking.association.initiation import unassociated_detections
 from hub.tracking.association.marginals import marginal_probabilities
 from hub.tracking.association.scan import AMBIGUOUS, associate_jointly
@@ -42,7 +44,7 @@ from hub.tracking.filter.manoeuvre import (
     within_reach,
 )
 from hub.tracking.filter.measurement import PredictedMeasurement, measurements_of, predict_measurement
-from hub.tracking.filter.prediction import predict_targets
+from hub.tracking.filter.prediction import on_floor, predict_targets
 from hub.tracking.filter.target_models import KIND_INDEX, TARGET_MODELS, UPRIGHT
 from hub.tracking.filter.target_states import DetectionStatistics, MultiTargetState, Scan, ScanFrame, Targets
 from hub.tracking.parameters import TrackerParameters, track_label
@@ -67,7 +69,7 @@ def process_frame(
     name, frame = frame.camera.name, frame.slanted(parameters.up)
     state = state.with_camera(name)
     if state.scan is None or any(one.frame.camera.name == name for one in state.scan.frames):
-        state = jointly(state, parameters)
+        state = concluded(state, parameters)
         state = replace(state, scan=Scan(state.targets, state.time_ns))
     elapsed = 0.0 if state.time_ns is None else (frame.reference_ns - state.time_ns) / NANOSECONDS
     state = with_floor_of(state, parameters)
@@ -96,23 +98,7 @@ def process_frame(
     return manage_tracks(initiate_tracks(state, frame, cameras, parameters), elapsed, parameters)
 
 
-def on_floor(targets: Targets, floor: Floor | None, elapsed: Floats | float) -> Targets:
-    """Upright targets with their feet on the floor, where it is known; ``elapsed`` (n,) or all, since the last time."""
-    elapsed = np.broadcast_to(elapsed, (len(targets),))
-    standing = np.flatnonzero(UPRIGHT[targets.kind] & (elapsed > 0.0))
-    if floor is None or not floor.known or not len(standing):
-        return targets
-    mean, covariance = targets.mean.copy(), targets.covariance.copy()
-    innovation, jacobian, variance = floor.constraint(mean[standing])
-    # What is uneven under somebody's foot now is so a moment later: half a second is one observation.
-    noise = variance * np.maximum(CORRELATION_S / elapsed[standing], 1.0)
-    cross = (covariance[standing] @ jacobian[:, :, None])[:, :, 0]
-    gain = cross / ((jacobian * cross).sum(axis=1) + noise)[:, None]
-    mean[standing] += gain * innovation[:, None]
-    covariance[standing] -= gain[:, :, None] * cross[:, None]
-    return replace(targets, mean=mean, covariance=covariance)
-
-
+@lru_cache(maxsize=2)  # a state is published before the next frame
 def jointly(state: MultiTargetState, parameters: TrackerParameters) -> MultiTargetState:
     """The state with the frames of its scan associated jointly."""
     scan, now, targets = state.scan, state.time_ns, state.targets
@@ -133,6 +119,24 @@ def jointly(state: MultiTargetState, parameters: TrackerParameters) -> MultiTarg
     state = replace(state, scan=replace(scan, frames=found.frames))
     targets = replace(found.targets, existence=np.minimum(found.targets.existence, MAX_EXISTENCE))
     return manage_tracks(replace(state, targets=targets), 0.0, parameters)
+
+
+@lru_cache(maxsize=2)
+def concluded(state: MultiTargetState, parameters: TrackerParameters) -> MultiTargetState:
+    """The state after its scan: associated jointly, and with people exchanged who were taken for each other before."""
+    state = jointly(state, parameters)
+    if state.scan is None or state.time_ns is None or state.encounters.time_ns == state.time_ns:
+        return state
+    encounters, targets = resolve_encounters(
+        state.encounters,
+        state.scan,
+        state.targets,
+        state.time_ns,
+        state.floor,
+        matching_colour_std(state.colour_variance),
+        parameters,
+    )
+    return replace(state, encounters=encounters, targets=targets)
 
 
 def prior_of_births(targets: Targets, floor: Floor | None, parameters: TrackerParameters) -> Targets:

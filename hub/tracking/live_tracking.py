@@ -159,7 +159,11 @@ class LiveTracking:
         if steps != self._seen_steps:
             self._seen_steps, self._seen_at = steps, now
         slow = state.interval_s > _SLOW_S
-        if slow and not state.scan_complete and now - self._seen_at < _WAIT * state.interval_s:
+        # Of the first instant it is not known yet which cameras have frames: all may.
+        unheard = (
+            state.scan is not None and state.scan.prior_ns is None and len(state.cameras) < len(self.tracker.cameras)
+        )
+        if slow and (unheard or not state.scan_complete) and now - self._seen_at < _WAIT * state.interval_s:
             return []  # at few frames a second, the cameras of an instant are awaited
         self._next, self._published_steps = now + _INTERVAL_S, steps
         published_ns, self._published_ns = self._published_ns, state.time_ns

@@ -28,9 +28,9 @@ from hub.tracking.filter.manoeuvre import (
     manoeuvre_hypothesis,
     widened_by_evidence,
 )
-from hub.tracking.filter.prediction import predict_targets
+from hub.tracking.filter.prediction import on_floor, predict_targets
 from hub.tracking.filter.target_states import ScanFrame, Targets
-from hub.tracking.frame_update import on_floor, prior_of_births
+from hub.tracking.frame_update import prior_of_births
 from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Bools, Floats, Ints

@@ -9,8 +9,8 @@ import numpy as np
 
 from hub.tracking.detections import FrameDetections, TrackingCamera, frame_detections
 from hub.tracking.filter.prediction import predict_targets
-from hub.tracking.filter.target_states import MultiTargetState, Targets
-from hub.tracking.frame_update import jointly, process_frame
+from hub.tracking.filter.target_states import Encounters, MultiTargetState, Targets
+from hub.tracking.frame_update import concluded, jointly, process_frame
 from hub.tracking.lag_buffer import LagBuffer
 from hub.tracking.parameters import TrackerParameters
 from protocols.core.clocks import NANOSECONDS
@@ -69,7 +69,8 @@ class Tracker:
         """The state after all processed frames."""
         state = self._frames.state
         if self._joint is None or self._joint[0] is not state:
-            self._joint = state, jointly(state, self.parameters)
+            known = concluded if state.scan_complete else jointly
+            self._joint = state, known(state, self.parameters)
         return self._joint[1]
 
     @property
@@ -163,4 +164,6 @@ def transform_state(state: MultiTargetState, change: Similarity) -> MultiTargetS
         replace(one, mean=one.mean @ transform.T + offset, covariance=transform @ one.covariance @ transform.T)
         for one in (state.targets, state.lost)
     )
-    return replace(state, targets=targets, lost=lost, unassociated={}, last_frame_ns={}, floor=None)
+    return replace(
+        state, targets=targets, lost=lost, unassociated={}, last_frame_ns={}, floor=None, encounters=Encounters.empty()
+    )

@@ -256,6 +256,14 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
     return rig, cameras
 
 
+def stated_up(rig: Rig, cameras: Mapping[str, CameraCalibration]) -> Floats | None:
+    """Up (3,), a unit vector in the world of a calibration that was read; None where it is not stated."""
+    up = rig.up
+    if isinstance(up, str):
+        up = cameras[up].pose.rotation.T @ rig.up_in_camera(up) if up in cameras else None
+    return None if up is None else np.asarray(up / np.linalg.norm(up))
+
+
 def _plain(value: Any) -> Any:
     """Convert to what TOML can hold: numpy numbers become Python's; -0.0 becomes 0.0."""
     if isinstance(value, dict):

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from protocols.geometry.types import Floats
-from protocols.session.calibration import Calibration, read_calibration, stated_calibration
+from protocols.session.calibration import Calibration, read_calibration, stated_calibration, stated_up
 from protocols.session.rig import Rig
 
 _ANY_SIZE = 1_000_000  # px: larger than any image, so that none is refused for its size
@@ -43,7 +41,4 @@ def read_given_calibration(file: Path) -> GivenCalibration:
     """Read calibration.toml. Raises InputError."""
     rig, cameras = read_calibration(file)
     calibration = stated_calibration(rig, cameras)
-    up = rig.up
-    if isinstance(up, str):
-        up = cameras[up].pose.rotation.T @ rig.up_in_camera(up)
-    return GivenCalibration(file, rig, calibration, None if up is None else np.asarray(up / np.linalg.norm(up)))
+    return GivenCalibration(file, rig, calibration, stated_up(rig, cameras))

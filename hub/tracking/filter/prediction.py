@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from hub.tracking.filter import kalman
+from hub.tracking.filter.detection_model import CORRELATION_S
+from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import VELOCITY
 from hub.tracking.filter.manoeuvre import units_of
 from hub.tracking.filter.target_models import TARGET_MODELS, UPRIGHT
@@ -36,3 +38,20 @@ def predict_targets(targets: Targets, elapsed: Floats | float, parameters: Track
     )
     existence = targets.existence * np.exp(-np.maximum(elapsed, 0.0) / parameters.lifetime_s)
     return replace(targets, mean=mean, covariance=covariance, existence=existence)
+
+
+def on_floor(targets: Targets, floor: Floor | None, elapsed: Floats | float) -> Targets:
+    """Upright targets with their feet on the floor, where it is known; ``elapsed`` (n,) or all, since the last time."""
+    elapsed = np.broadcast_to(elapsed, (len(targets),))
+    standing = np.flatnonzero(UPRIGHT[targets.kind] & (elapsed > 0.0))
+    if floor is None or not floor.known or not len(standing):
+        return targets
+    mean, covariance = targets.mean.copy(), targets.covariance.copy()
+    innovation, jacobian, variance = floor.constraint(mean[standing])
+    # What is uneven under somebody's foot now is so a moment later: half a second is one observation.
+    noise = variance * np.maximum(CORRELATION_S / elapsed[standing], 1.0)
+    cross = (covariance[standing] @ jacobian[:, :, None])[:, :, 0]
+    gain = cross / ((jacobian * cross).sum(axis=1) + noise)[:, None]
+    mean[standing] += gain * innovation[:, None]
+    covariance[standing] -= gain[:, :, None] * cross[:, None]
+    return replace(targets, mean=mean, covariance=covariance)

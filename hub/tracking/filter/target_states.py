@@ -121,6 +121,35 @@ class Scan:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Encounters:
+    """Of k pairs of targets, that they were exchanged. time_ns: of all states. pair: (k, 2) initiation numbers. mean,
+    covariance: (k, 2, 7), (k, 2, 7, 7) of both, had each made the other's detections since. colour: (k, 2, 3) before.
+    log_odds: (k,) against the present tracks. opened_ns: (k,) scan at which they were exchanged."""
+
+    time_ns: int | None
+    pair: Ints
+    mean: Floats
+    covariance: Floats
+    colour: Floats
+    log_odds: Floats
+    opened_ns: Ints
+
+    def select(self, index: Ints) -> Encounters:
+        """Some of them."""
+        return Encounters(self.time_ns, *(getattr(self, name)[index] for name in self.__slots__[1:]))
+
+    @classmethod
+    def empty(cls) -> Encounters:
+        """None."""
+        none = np.zeros(0, dtype=np.int64)
+        shape = (0, 2, STATE_DIM)
+        return cls(
+            None, np.zeros((0, 2), dtype=np.int64), np.zeros(shape), np.zeros((*shape, STATE_DIM)),
+            np.zeros((0, 2, 3)), np.zeros(0), none,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MultiTargetState:
     """The complete tracker state after a frame: a function of the frames so far, in the order of their keys.
 
@@ -128,7 +157,7 @@ class MultiTargetState:
     associated with no target. last_frame_ns, statistics: by camera. lost: tracks kept for re-identification, oldest
     first, as predicted to the time lost_ns (k,) at which they were lost. floor: on which upright targets stand.
     colour_variance: of one channel, between a detection's colour and the stored colour of its target. scan: the last
-    frames of all cameras, whose association may still change.
+    frames of all cameras, whose association may still change. encounters: pairs that may have been exchanged.
     """
 
     time_ns: int | None
@@ -144,6 +173,7 @@ class MultiTargetState:
     colour_variance: float = 400.0
     statistics: dict[str, DetectionStatistics] = field(default_factory=dict)
     scan: Scan | None = None
+    encounters: Encounters = field(default_factory=Encounters.empty)
 
     @property
     def scan_complete(self) -> bool:

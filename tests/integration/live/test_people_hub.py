@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+<<<<<<< HEAD
+=======
+import threading
+from dataclasses import replace
+>>>>>>> issue-crowd
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +23,7 @@ from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.clocks import NANOSECONDS
+from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
@@ -84,6 +90,16 @@ def test_a_replayed_log_tracks_everybody_with_equal_bytes(log: Path, known: Path
     assert len(rows) > 100
     heads = [m.message for m in LogReader(tmp_path / "one.mcap").messages([PREDICTION])]
     assert any(target.face for message in heads for camera in message.cameras for target in camera.targets)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("stated", "up"), [(np.array([0.0, -2.0, 0.0]), [0, -1, 0]), (None, None)])
+def test_up_is_where_a_known_calibration_states_it(known: Path, stated: Floats | None, up: list[float] | None) -> None:
+    """Of one whose world has y down people were tracked as if z were up."""
+    rig, cameras = read_calibration(known)
+    hub = LiveHub(LiveSettings(), known=KnownCalibration(replace(rig, up=stated), cameras))
+    assert hub.tracking is not None
+    given = hub.tracking.tracker.parameters.up
+    assert (None if given is None else given.tolist()) == up
 
 
 @pytest.mark.parametrize("through", [[], ["--through", "uav"]])

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deploy.evaluation.tracking_scores import score_tracks
 from edge import scenes
 from edge.scenes.common.placement import look_at_pose
 from hub.tracking.association.initiation import LengthScale
@@ -24,6 +25,7 @@ from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration
+from tests.bench import hall
 from tests.support.people_traffic import Faults, Traffic, cameras_of, film
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -189,6 +191,29 @@ def test_identities_survive_two_seconds_without_detections(traffic: Traffic) -> 
             shown[t - begin > 5.0] = dict(zip([p.name for p in traffic.scene.people], names, strict=True))
     assert len(set(shown[False].values())) == 3
     assert shown[True] == shown[False]
+
+
+def test_people_who_were_exchanged_in_a_meeting_are_exchanged_back() -> None:
+    """At 3 frames a second, who walks towards another and stops is where the other was expected.
+
+    Without the second hypothesis IDF1 is 0.956 here.
+    """
+    known = hall.simulated(723, people=28, fps=3.0, seconds=10.0)
+    scores = score_tracks(known.truth, hall.live(known), known.times, 1.0)
+    assert float(scores["idf1"] or 0.0) > 0.97
+    assert scores["switches"] == 0
+
+
+def test_the_first_instant_is_published_with_all_its_cameras() -> None:
+    """With its first camera's frame alone nobody was tracked at it, and its other frames were never published."""
+    known = hall.simulated(1, cameras=5, people=4, fps=2.0, seconds=0.5)
+    tracking = LiveTracking()
+    tracking.calibrate(known.calibration.cameras, {}, reference="cam0", scale="metric", units="m", up=UP)
+    published = []
+    for _, message in known.messages:
+        tracking.handle(message)
+        published.append(bool(tracking.tick(0.0)))
+    assert published == [False, False, False, False, True]
 
 
 def test_two_tracks_at_one_position_become_the_older_one(traffic: Traffic) -> None:
