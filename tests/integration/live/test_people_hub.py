@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-<<<<<<< HEAD
-=======
-import threading
 from dataclasses import replace
->>>>>>> issue-crowd
 from pathlib import Path
 
 import numpy as np
