@@ -244,7 +244,7 @@ class ViewState:
         refused = sum(camera.verdict == "refused" for camera in self.cameras.values())
         parts = [
             f"{word}: {_counted(len(shown.cameras))}",
-            f"lags ± {1e3 * max(stds, default=0.0):.2g} ms",
+            f"lags ± {1e3 * max(stds):.2g} ms" if any(stds) else "",  # not known, as of other tools' calibrations
             f"{refused} refused" if refused else "",
             found.reason if word == "degraded" else "",
         ]

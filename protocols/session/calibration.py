@@ -27,6 +27,8 @@ _REPLACED_METADATA = (
     "reference",
 )  # fmt: skip
 """Metadata keys of rig.toml that the result replaces."""
+_LAG_KEYS = ("lag_time", "lag_std", "clock_rate_std")
+"""What says where a lag's std holds: without them a hub that goes on from the file has a lag of no std."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +172,7 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
         table = dict(rig.cameras[name].table) if name in rig.cameras else {}
         # A surveyed position is an input: the estimate is the translation, and two values that differ by the
         # survey's error would contradict each other.
-        for key in ("position", "position_std", "rotation_std", "focal_std", "ball_outline"):
+        for key in ("position", "position_std", "rotation_std", "focal_std", "ball_outline", *_LAG_KEYS):
             table.pop(key, None)
         table |= {
             "name": name,
@@ -183,6 +185,8 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
             "position_std": camera.position_std.tolist(),
             "rms_px": camera.rms_px,
         }
+        if camera.lag_time != 0.0:
+            table |= {key: getattr(camera, key) for key in _LAG_KEYS}
         if camera.focal_std > 0.0:
             table["focal_std"] = camera.focal_std
         if camera.readout != 0.0:
@@ -240,10 +244,12 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
             what = f"[{name}] time_offset {offset!r} and clock_rate {rate!r} are no clock"
             raise InputError(what, file=file, remedy="give a number of seconds, and a rate near 1")
         std = camera.position_std
-        figures = {key: table.get(key, 0.0) for key in ("time_offset_std", "rms_px")}
+        figures = {key: table.get(key, 0.0) for key in ("time_offset_std", "rms_px", *_LAG_KEYS)}
         for key, value in figures.items():
-            if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < np.inf:
-                raise InputError(f"[{name}] {key} is not a number >= 0", file=file, remedy="correct it")
+            least = -np.inf if key == "lag_time" else 0.0
+            if not isinstance(value, int | float) or isinstance(value, bool) or not least <= value < np.inf:
+                what = "a number" if key == "lag_time" else "a number >= 0"
+                raise InputError(f"[{name}] {key} is not {what}", file=file, remedy="correct it")
         cameras[name] = CameraCalibration(
             name=name,
             intrinsics=camera.intrinsics,
@@ -253,6 +259,7 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
             position_std=np.zeros(3) if std is None else std,
             rms_px=float(figures["rms_px"]),
             readout=camera.readout or 0.0,
+            **{key: float(figures[key]) for key in _LAG_KEYS},
         )
     return rig, cameras
 
