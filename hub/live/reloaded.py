@@ -78,8 +78,8 @@ def on_new_clock(camera: CameraCalibration, shift: float, then: float, now: floa
     """A calibrated camera whose clock, or whose reference camera's, began anew, by delays against the hub's clock.
 
     A camera's delay is the hub's clock less its own. shift: its delay now less then, less the same of the reference
-    camera: what the hub's clock was set by meanwhile cancels. then, now: its times [s], between which its rate counts; the
-    lag is that of now. Both differ from the truth by the variation of the network's delays.
+    camera: what the hub's clock was set by meanwhile cancels. then, now: its times [s], between which its rate counts;
+    the lag is that of now. Both differ from the truth by the variation of the network's delays.
     """
     rate = camera.time_map.clock_rate
     offset = camera.time_map.time_offset + shift + (rate - 1.0) * (then - now)

@@ -31,6 +31,7 @@ _PATH_INTERVAL_S = 1 / 30  # between two kept points of a trajectory: tracks com
 _NEW_CLOCK_S = 5.0  # a track that goes back by more is on another clock
 _MAX_PATHS = 48  # tracked people get new labels: the track not updated for longest is dropped
 _MAX_PROBLEMS = 3  # in the headline
+_MAX_ALARM = 300  # characters of the status of an agent that is still starting
 
 CameraState = Literal["calibrated", "degraded", "searching", "collecting", "refused", "silent", "gone"]
 """The hub's word for a camera, or that no frames come."""
@@ -261,6 +262,8 @@ class ViewState:
                     out.append(f"{name} has ended" + (f": {status.message}" if status.state == "stopping" else ""))
             elif status.state == "degraded" or (status.state == "stopping" and role == "record"):
                 out.append(f"{name}: {status.message or status.state}")
+            elif status.counters.get("alarms"):  # they come first; a hub that waits says much else
+                out.append(f"{name}: {status.message[:_MAX_ALARM]}")
             elif role != "camera" and now - agent.at > STALE_S:
                 out.append(f"{name} has sent no status for {now - agent.at:.0f} s")
         more = len(out) - _MAX_PROBLEMS

@@ -117,7 +117,7 @@ def _id(text: str, field: str, *, optional: bool = False) -> None:
     try:
         check_identifier(text, field)
     except InputError as error:
-        raise Rejected(RejectionReason.BAD_ID, error.what) from None
+        raise Rejected(RejectionReason.BAD_ID, f"{error.what}: {error.remedy}") from None
 
 
 def _text(text: str, name: str, most: int = MAX_TEXT) -> None:
