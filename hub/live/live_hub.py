@@ -33,6 +33,7 @@ from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import LONG_FILM_S, SessionBuilder
 from protocols.session.calibration import Calibration, CameraCalibration, stated_calibration
+from protocols.session.folder import pixel_faults, small_pictures
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -131,6 +132,8 @@ class LiveHub:
         self.session: tuple[Rig, Observations] | None = None
         self.refusal: Refused | None = None
         self.solver_failure = ""
+        self._pixel_faults: dict[str, str] = {}
+        """By camera, why its rows are not used; by "", what is to be checked of all of them."""
         self.calibrated_at = self._now
         """When the present calibration was estimated or, of a given one, began to be used."""
         self._solved_boot_ids: dict[str, str] = {}
@@ -351,7 +354,7 @@ class LiveHub:
             out.append(f"frames left out of {listed(exceeding)}: more than a camera may send")
         if self._schedule.left_out:
             out.append(f"{self._schedule.left_out} is left out: the solver failed with its rows")
-        out += [*self.links.notices.values(), *self.links.standing.values()][:8]
+        out += [*self.links.notices.values(), *self.links.standing.values(), *self._pixel_faults.values()][:8]
         if self.solver.busy and now - self._submitted_at > _BEHIND_S:
             out.append(f"the solver is behind: {now - self._submitted_at:.0f} s for one job")
         return out + [text for text in (self.solver_failure, self.notice) if text]
@@ -364,7 +367,8 @@ class LiveHub:
         out = []
         shared = self.stream.marker.shared_motions_s()
         for name in self.stream.marker.cameras:
-            reason = self.links.standing.get(name) or waiting.get(name, refused.get(name, ""))
+            fault = self.links.standing.get(name) or self._pixel_faults.get(name)
+            reason = fault or waiting.get(name, refused.get(name, ""))
             rows, least = self.stream.marker.rows(name), self.settings.least_rows
             state = "searching" if rows >= least else "collecting"
             if not self.stream.has_info(name):
@@ -412,7 +416,7 @@ class LiveHub:
     def _submit(self, now: float, final: bool) -> list[Message]:
         """Hand the present observations to the solver; a final job searches for every camera that is not tied."""
         try:
-            rig, observations = self._build_session()
+            rig, observations = self._without_other_pixels(*self._build_session())
         except Refused as refusal:
             self.refusal = refusal
             return []
@@ -592,6 +596,20 @@ class LiveHub:
         """The rig and the observations: of the marker or, if there is none, of people."""
         rig, observations = self.stream.build(self._has_marker() or not self.settings.solve)
         return merge_rigs(rig, self._rig), observations
+
+    def _without_other_pixels(self, rig: Rig, observations: Observations) -> tuple[Rig, Observations]:
+        """The session without the cameras whose rows are no pixels of their images. Raises Refused without two others.
+
+        Their rows would make the answer wrong, or the camera be waited for without end.
+        """
+        faults = self._pixel_faults = {name: str(one) for name, one in pixel_faults(rig, observations).items()}
+        for name in faults:
+            rig, observations = without_camera(rig, observations, name)
+        if faults and len(observations.cameras) < 2:
+            raise Refused("fewer than two cameras have pixels of their images", dict(faults))
+        if small := small_pictures(rig, observations):
+            self._pixel_faults = {**faults, "": small}
+        return rig, observations
 
     def _source(self) -> SessionBuilder | PeopleTracklets:
         return self.stream.marker if self._has_marker() else self.stream.people

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -205,6 +206,48 @@ def test_a_lens_that_cannot_be_costs_only_its_camera(session: Session) -> None:
     feed(hub, hostile(session, distortion=MAX_DISTORTION), batch=10**9)
     assert hub.calibration is not None
     assert set(hub.calibration.cameras) == {"cam0", "cam1"}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda u, v: (u / 1280, v / 720), "fractions of it; multiply u by its width"),
+        (lambda u, v: (v, u), "swap u and v"),
+        (lambda u, v: (2 * u, 2 * v), "pixels of a larger one"),
+        (lambda u, v: (u / 2, v / 2), "its rows are pixels of pictures of 1/2 the size"),
+        (lambda u, v: (u, 719 - v), "its image is mirrored"),
+    ],
+)
+def test_a_camera_whose_pixels_are_of_another_image_is_named(
+    change: Callable[[float, float], tuple[float, float]], reason: str
+) -> None:
+    """Such cameras were told to wave the ball elsewhere, or that they fit at no lag yet."""
+    session = simulate(3, 4, 30.0)
+    stream = messages(session)
+    for message in stream:
+        if message.camera == "cam3" and isinstance(message, pb.Observation):  # type: ignore[attr-defined]
+            one = message.detections[0]
+            one.u, one.v = change(one.u, one.v)
+    hub = LiveHub(SETTINGS)
+    feed(hub, stream)
+    assert hub.calibration is not None
+    assert set(hub.calibration.cameras) == {"cam0", "cam1", "cam2"}
+    assert reason in next(one.reason for one in hub.progress() if one.camera == "cam3")
+
+
+def test_pictures_of_another_size_are_refused_by_a_hub_too() -> None:
+    """Half the pixels of all cameras gave an answer of two of them, with a clock step that none had."""
+    stream = messages(simulate(3, 4, 30.0))
+    for message in stream:
+        for one in message.detections if isinstance(message, pb.Observation) else ():
+            one.u, one.v = one.u / 2, one.v / 2
+    hub = LiveHub(SETTINGS)
+    feed(hub, stream)
+    assert hub.calibration is None
+    state, text = hub.state(1e6)
+    assert state == "searching"
+    assert "upper left of its picture" in text
+    assert "as those of pictures of 1/2 the size" in text
 
 
 def test_a_repeated_time_stamp_does_not_refuse_the_session_of_a_log(session: Session) -> None:
