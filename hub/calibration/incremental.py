@@ -166,7 +166,7 @@ def update_calibration(
     reconstruction, failures, misfitting = _adjust_without_failures(
         prepared, reconstruction, refused | reasons, warm=not full and near, refine_lenses=refine_lenses
     )
-    failures |= _other_images(prepared, reconstruction, new if full else [])
+    failures |= _other_images(prepared, reconstruction, new if search else [])
     larger = larger_residuals(reconstruction, last.cameras)
     if larger and len(reconstruction.names) == 2:  # each hides in the other's path, as far as this can follow
         texts = {name: f"residuals of {sigma:.1f} px, {rms:.1f} px before" for name, (sigma, rms) in larger.items()}

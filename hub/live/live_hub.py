@@ -209,6 +209,28 @@ class LiveHub:
             kept = {name: one for name, one in self.calibration.cameras.items() if name not in cameras}
             self.calibration = replace(self.calibration, cameras=kept) if len(kept) > 1 else None
 
+    def forget_silent(self, now: float) -> list[str]:
+        """Forget the cameras that send no frames, as those that were taken away or renamed; their names, in order.
+
+        A given calibration is kept as it is, and so are the cameras that hubs share.
+        """
+        silent = [name for name, age in self.frame_ages(now).items() if age > SILENT_S]
+        heard = {*self.stream.marker.cameras, *(() if self.calibration is None else self.calibration.cameras)}
+        names = sorted({*silent, *(heard - self.links.last_frame.keys())})
+        if self._known is not None or self.is_shard or not names:
+            return []
+        self._superseded, self._answer_rows, self._reloaded = self._jobs, 0.0, None  # they may be in a job under way
+        self.release(names)
+        for name in names:
+            self.guidance.forget(name)
+            self.links.forget(name)
+            self._pixel_faults.pop(name, None)
+        if self.calibration is not None:
+            left = {name: why for name, why in self.calibration.refused.items() if name not in names}
+            self.calibration = replace(self.calibration, refused=left)
+            self._clock_stepped = True  # published with the next tick
+        return names
+
     def adopt(self, calibration: Calibration, boot_ids: Mapping[str, str]) -> None:
         """Go on from another hub's answer, about other cameras than before. boot_ids: of the clocks of its maps."""
         self._superseded, self._answer_rows, self._reloaded, self.refusal = self._jobs, 0.0, None, None

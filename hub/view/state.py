@@ -351,6 +351,7 @@ class ViewState:
                     camera.lags.add(found, clocks, now)
             for name, camera in self.cameras.items():
                 camera.calibration = solved.get(name)
+            self._forget({*solved, *refused, *progress}, now)
         word = _word(message)
         for name in progress:
             self._camera(name)
@@ -367,6 +368,14 @@ class ViewState:
                 camera.verdict = waiting if camera.calibration is None else "calibrated"
             camera.refused = camera.reason if camera.verdict == "refused" else ""
             camera.refusals += camera.verdict == "refused" != was
+
+    def _forget(self, known: set[str], now: float) -> None:
+        """Drop the cameras that send nothing and that the hub no longer speaks of, as it was asked to forget them."""
+        for name, camera in list(self.cameras.items()):
+            if camera.progress is not None and name not in known and camera.state(now) in ("silent", "gone"):
+                del self.cameras[name]
+                self.agents.pop(name, None)
+                self.guidance.forget(name)
 
 
 def _word(message: pb.Calibration) -> str:

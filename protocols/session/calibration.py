@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +155,33 @@ def stated_calibration(rig: Rig, cameras: dict[str, CameraCalibration]) -> Calib
     )
 
 
+def on_present_clock(calibration: Calibration) -> Calibration:
+    """The calibration on the clock of one of its cameras, where the reference camera is none of them any more.
+
+    A hub holds its reference clock when that camera has gone; a file's reference clock has to be one of its cameras'.
+    The new one is the camera whose lag is known best, as of which the others' stds are.
+    """
+    cameras = calibration.cameras
+    if calibration.reference in cameras or not cameras:
+        return calibration
+    name = min(cameras, key=lambda one: cameras[one].time_offset_std)
+    base, std = cameras[name].time_map, cameras[name].time_offset_std
+    moved = {
+        one: replace(
+            camera,
+            time_map=TimeMap(
+                camera.time_map.clock_rate / base.clock_rate,
+                (camera.time_map.time_offset - base.time_offset) / base.clock_rate,
+            ),
+            time_offset_std=float(np.hypot(camera.time_offset_std, std)) if one != name else 0.0,
+            lag_std=float(np.hypot(camera.lag_std, std)) if one != name else 0.0,
+        )
+        for one, camera in cameras.items()
+    }
+    paths = (replace(path, time=(path.time - base.time_offset) / base.clock_rate) for path in calibration.trajectories)
+    return replace(calibration, cameras=moved, reference=name, trajectories=tuple(paths))
+
+
 def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
     """The content of calibration.toml: rig.toml's tables with the estimates added."""
     tables: dict[str, Any] = {}
@@ -202,7 +229,7 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
 
 def calibration_text(calibration: Calibration, rig: Rig) -> str:
     """The text of calibration.toml, which aniposelib loads unchanged."""
-    return tomli_w.dumps(_plain(calibration_tables(calibration, rig)))
+    return tomli_w.dumps(_plain(calibration_tables(on_present_clock(calibration), rig)))
 
 
 def trajectory_text(calibration: Calibration) -> str:

@@ -492,7 +492,7 @@ def _shard(message: pb.Shard) -> None:
         _number(overlap.seconds, "seconds", 0.0, MAX_TIME_S)
 
 
-ACTIONS = frozenset({"start_recording", "stop_recording", "recalibrate", "export"})
+ACTIONS = frozenset({"start_recording", "stop_recording", "recalibrate", "forget", "export"})
 MAX_PICTURE = 512 * 1024  # bytes of a thumbnail
 
 

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from google.protobuf.message import Message
 
+from deploy.agents.answer_store import AnswerStore
+from deploy.agents.assembly import write_last
 from hub.live.agent import status_message
 from hub.live.live_hub import LiveHub, LiveSettings
 from hub.live.solver import InlineSolver, SolverAnswer, SolverJob
-from protocols.core.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.ranges import MAX_DISTORTION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
+from protocols.session.calibration import read_calibration
 from tests.support.rigs import Session, simulate
 
 SETTINGS = LiveSettings(window_s=60.0, interval_s=2.0)
@@ -304,6 +308,56 @@ class RefusingSolver(InlineSolver):
 
     def submit(self, job: SolverJob, now: float) -> None:
         self._answer = SolverAnswer(job.number, reason="no two cameras", refused={"cam1": "only 10 % fit"})
+
+
+@pytest.mark.parametrize("gone", ["cam0", "cam2"])
+def test_a_camera_that_was_taken_away_is_forgotten_on_request(session: Session, gone: str, tmp_path: Path) -> None:
+    """One renamed or removed kept the hub degraded for ever. cam0 is the reference."""
+    stream = messages(session)
+    hub = LiveHub(SETTINGS)
+    half = len(stream) // 2
+    for number, message in enumerate(stream[:half]):
+        hub.handle(message)
+        if number % 100 == 99:
+            hub.tick(0.01 * number)
+    assert hub.calibration is not None
+    before = hub.calibration.cameras
+    assert set(before) == {"cam0", "cam1", "cam2"}
+    now = 0.01 * half
+    assert hub.forget_silent(now) == [], "none is silent"
+    rest = [message for message in stream[half:] if message.camera != gone]  # type: ignore[attr-defined]
+    for number, message in enumerate(rest):
+        hub.handle(message)
+        if number % 100 == 99:
+            hub.tick(now + 0.01 * number)
+    now += 0.01 * len(rest)
+    assert hub.state(now)[0] == "degraded"
+    assert hub.forget_silent(now) == [gone]
+    assert hub.state(now)[0] == "calibrated"
+    (published, *_) = calibrations(hub.tick(now))
+    assert gone not in [one.camera for one in (*published.cameras, *published.progress, *published.refused)]
+    hub.tick(now + 5.0, final=True)
+    hub.tick(now + 6.0)
+    assert set(hub.calibration.cameras) == set(before) - {gone}
+    for name, camera in hub.calibration.cameras.items():  # on the clock and in the world of before
+        at = before[name].lag_time
+        shift = (camera.time_map.clock_rate - before[name].time_map.clock_rate) * at
+        assert abs(shift + camera.time_map.time_offset - before[name].time_map.time_offset) < 1e-3
+    assert not any(gone in one.text for one in hub.guidance.advice(9))
+    assert hub.session is not None
+    store = AnswerStore(tmp_path)
+    store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.links.delays)
+    store.close()
+    kept = AnswerStore(tmp_path).load()
+    assert kept is not None, "a reference camera that is not in it made the file unreadable"
+    for name, camera in kept[0].cameras.items():
+        assert abs(session.clock_error(name, kept[0].reference, camera.time_map)) < 1e-3
+        assert (camera.time_offset_std > 0.0) == (name != kept[0].reference)
+    write_last(hub, tmp_path / "out")
+    _, written = read_calibration(tmp_path / "out" / "calibration.toml")
+    path = np.loadtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", skiprows=1, usecols=0)
+    spans = [written[name].time_map.reference_from_camera(CameraTime(written[name].lag_time)) for name in written]
+    assert all(path[0] < span < path[-1] for span in spans)
 
 
 def test_an_answer_that_the_newest_rows_contradict_is_kept_and_the_hub_says_so(session: Session) -> None:
