@@ -48,6 +48,7 @@ _BEHIND_S = 10.0
 SILENT_S = 3.0
 """A camera without a frame for longer than this degrades the hub."""
 _VERIFY_EVERY_S = 0.5  # s: between two tests of a reloaded answer
+_CHECK_EVERY_S = 60.0  # s: between two tests of a given calibration, which take a second or two
 _BUDGET_NOTICE_S = 10.0
 """How long the status names a camera that exceeded its budget."""
 _MAX_STD_GROWTH = 1.5
@@ -132,6 +133,7 @@ class LiveHub:
         self.session: tuple[Rig, Observations] | None = None
         self.refusal: Refused | None = None
         self.solver_failure = ""
+        self._next_check, self._known_faults = 0.0, list[str]()
         self._pixel_faults: dict[str, str] = {}
         """By camera, why its rows are not used; by "", what is to be checked of all of them."""
         self.calibrated_at = self._now
@@ -377,6 +379,8 @@ class LiveHub:
         if self._schedule.left_out:
             out.append(f"{self._schedule.left_out} is left out: the solver failed with its rows")
         out += [*self.links.notices.values(), *self.links.standing.values(), *self._pixel_faults.values()][:8]
+        if self._known_faults:
+            out.append(f"the given calibration: {'; '.join(self._known_faults[:4])}")
         if self.solver.busy and now - self._submitted_at > _BEHIND_S:
             out.append(f"the solver is behind: {now - self._submitted_at:.0f} s for one job")
         return out + [text for text in (self.solver_failure, self.notice) if text]
@@ -424,6 +428,8 @@ class LiveHub:
             return []
         self._schedule.next = now + (_VERIFY_EVERY_S if self.unverified else self.settings.interval_s)
         if self._known is not None:
+            if not final:
+                self._check_known(now)
             return self._publish_present(changed=False)
         if not self.settings.solve:
             return self._use_nodes()
@@ -481,6 +487,33 @@ class LiveHub:
         ranges = [one for one in self.stream.marker.ranges() if one[0] in rig.cameras] if self._has_marker() else []
         return self._hand_over(job, boots, ranges, now)
 
+    def _check_known(self, now: float) -> None:
+        """Have the given calibration tested by the present rows, every minute; the answer is for the status."""
+        assert self.calibration is not None
+        rows = [self.stream.marker.rows(name) for name in self.calibration.cameras]
+        if now < self._next_check or not self._has_marker() or sum(count >= VERIFY_ROWS for count in rows) < 2:
+            return
+        self._next_check = now + _CHECK_EVERY_S
+        try:
+            _, observations = self._build_session()
+        except (Refused, InputError):
+            return
+        assert self._rig is not None
+        tracks = {key: one for key, one in observations.tracks.items() if key[0] in self.calibration.cameras}
+        observations = replace(observations, tracks=tracks)
+        self._jobs += 1
+        job = SolverJob(self._jobs, self._rig, observations, self.calibration, verify=True)
+        self._submitted, self._submitted_at, self._submitted_boots = job, now, {}
+        self.solver.submit(job, now)
+
+    def _take_check(self, answer: SolverAnswer) -> None:
+        """What the present rows say of the given calibration; that they say too little is no news."""
+        found = answer.calibration
+        if found is None:
+            self._known_faults = [answer.reason] if answer.permanent else []
+            return
+        self._known_faults = [*(f"{name}: {why}" for name, why in found.refused.items()), *found.warnings]
+
     def _hand_over(
         self, job: SolverJob, boots: dict[str, str], ranges: list[tuple[str, str, int, int, int]], now: float
     ) -> list[Message]:
@@ -505,6 +538,9 @@ class LiveHub:
         """Use an answer: the calibration that it gives, or why there is none."""
         job, boots = self._submitted, self._submitted_boots
         self._submitted = None
+        if self._known is not None:
+            self._take_check(answer)
+            return []
         tied, cameras = (len(one.cameras) if one else 0 for one in (self.calibration, job and job.rig))
         self._schedule.pause(self._submitted_at, answer.cpu_s, calibrated=2 * tied > cameras)
         if job is None or answer.number <= self._superseded:

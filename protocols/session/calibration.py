@@ -286,7 +286,9 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
             position_std=np.zeros(3) if std is None else std,
             rms_px=float(figures["rms_px"]),
             readout=camera.readout or 0.0,
-            **{key: float(figures[key]) for key in _LAG_KEYS},
+            lag_time=float(figures["lag_time"]),
+            lag_std=float(figures["lag_std"]),
+            clock_rate_std=float(figures["clock_rate_std"]),
         )
     return rig, cameras
 

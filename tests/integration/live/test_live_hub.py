@@ -13,10 +13,11 @@ from google.protobuf.message import Message
 from deploy.agents.answer_store import AnswerStore
 from deploy.agents.assembly import write_last
 from hub.live.agent import status_message
-from hub.live.live_hub import LiveHub, LiveSettings
+from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
 from hub.live.solver import InlineSolver, SolverAnswer, SolverJob
 from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.ranges import MAX_DISTORTION
+from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
 from protocols.session.calibration import read_calibration
@@ -358,6 +359,49 @@ def test_a_camera_that_was_taken_away_is_forgotten_on_request(session: Session, 
     path = np.loadtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", skiprows=1, usecols=0)
     spans = [written[name].time_map.reference_from_camera(CameraTime(written[name].lag_time)) for name in written]
     assert all(path[0] < span < path[-1] for span in spans)
+
+
+@pytest.mark.parametrize(
+    ("pose", "clock", "scale", "said"),
+    [
+        (lambda pose: pose, 0.0, "arbitrary", ""),
+        (
+            lambda pose: Pose(pose.rotation.T, -pose.rotation @ pose.position),
+            0.0,
+            "arbitrary",
+            "rotation and translation are world from",
+        ),
+        (lambda pose: pose, 1e4, "arbitrary", "was its clock set anew?"),
+        (lambda pose: Pose(pose.rotation, 2000.0 * pose.position), 0.0, "metric", "seem not to be in m"),
+    ],
+)
+def test_a_given_calibration_that_the_rows_contradict_is_named(
+    session: Session, pose: Callable[[Pose], Pose], clock: float, scale: str, said: str
+) -> None:
+    """A hub with one of another convention, unit or run of the cameras was `calibrated`, and tracked nobody."""
+    stream = messages(session)
+    hub = LiveHub(SETTINGS)
+    feed(hub, stream)
+    assert hub.calibration is not None
+    assert hub.session is not None
+    cameras = {
+        name: replace(camera, pose=pose(camera.pose)) if clock == 0.0 else camera
+        for name, camera in hub.calibration.cameras.items()
+    }
+    if clock:
+        for number, (name, camera) in enumerate(cameras.items()):
+            one = camera.time_map
+            cameras[name] = replace(camera, time_map=replace(one, time_offset=one.time_offset + clock * number))
+    metadata = {"reference": hub.calibration.reference, "scale": scale}
+    given = LiveHub(SETTINGS, known=KnownCalibration(replace(hub.session[0], metadata=metadata), cameras))
+    assert given.state(0.0)[0] != "refused"
+    for number, message in enumerate(stream):
+        given.handle(message)
+        if number % 200 == 199:
+            given.tick(0.01 * number)
+    state, text = given.state(0.01 * len(stream))
+    assert state == ("degraded" if said else "calibrated"), text
+    assert said in text
 
 
 def test_an_answer_that_the_newest_rows_contradict_is_kept_and_the_hub_says_so(session: Session) -> None:
