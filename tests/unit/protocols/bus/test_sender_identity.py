@@ -105,9 +105,8 @@ def test_who_sends_only_what_cannot_be_used_is_named_with_the_reason_while_it_la
     assert "cam2" not in told.message
     for number in range(9):
         bus.record_refusal(Refusal("unknown_key", "", f"syncline/local/camera/cam%2C{number}/info", "no topic"))
-    assert (
-        "messages of syncline/local/camera/cam%2C0/info are not used: no topic;" in bus.with_diagnostics(status).message
-    )
+    told = bus.with_diagnostics(status)
+    assert "messages of syncline/local/camera/cam%2C0/info are not used: no topic;" in told.message
     assert "messages of 8 more are not used" in told.message
     now += 2 * SOURCE_TIMEOUT_S
     assert bus.with_diagnostics(status).state == "running"
