@@ -178,6 +178,7 @@ def write_last(hub: object, out: Path) -> None:
     from deploy.offline.outputs import report_refusal, report_result
     from hub.api import CalibrationResult
     from hub.live.live_hub import LiveHub
+    from protocols.session.calibration import on_present_clock
     from protocols.session.session import Session
 
     assert isinstance(hub, LiveHub)
@@ -185,7 +186,7 @@ def write_last(hub: object, out: Path) -> None:
         return
     session = Session(*hub.session)
     if hub.calibration is not None:
-        report_result(CalibrationResult(hub.calibration, session), out, "syncline hub")
+        report_result(CalibrationResult(on_present_clock(hub.calibration), session), out, "syncline hub")
     elif hub.refusal is not None:
         report_refusal(hub.refusal, session, out, "syncline hub")
 

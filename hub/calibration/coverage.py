@@ -83,6 +83,11 @@ class CoverageMonitor:
         self._frames.clear()
         self._rows.clear()
 
+    def forget(self, camera: str) -> None:
+        """Forget a camera, as if it had never been heard of."""
+        for of_camera in (self._sizes, self._targets, self._cells, self._frames, self._rows):
+            of_camera.pop(camera, None)
+
     def covered_cells(self, camera: str) -> Bools:
         """(ROWS, COLUMNS): cells of a camera's image in which it saw the target."""
         cells = self._cells.get(camera, bytes(ROWS * COLUMNS))

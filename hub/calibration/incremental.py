@@ -31,7 +31,7 @@ from hub.calibration.pairs.moved_pair import LEAST_SIDE_S, PairDivision, find_di
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pipeline import calibrate
 from hub.calibration.resection.moved_cameras import Move, moved_camera, without_moved
-from hub.calibration.resection.scan import scan_resection
+from hub.calibration.resection.scan import other_image, scan_resection
 from hub.calibration.result import assemble_calibration
 from hub.calibration.self_calibration import focal_prior, initial_self_calibration, with_cameras, with_lens
 from hub.calibration.solution import Solution
@@ -166,6 +166,7 @@ def update_calibration(
     reconstruction, failures, misfitting = _adjust_without_failures(
         prepared, reconstruction, refused | reasons, warm=not full and near, refine_lenses=refine_lenses
     )
+    failures |= _other_images(prepared, reconstruction, new if search else [])
     larger = larger_residuals(reconstruction, last.cameras)
     if larger and len(reconstruction.names) == 2:  # each hides in the other's path, as far as this can follow
         texts = {name: f"residuals of {sigma:.1f} px, {rms:.1f} px before" for name, (sigma, rms) in larger.items()}
@@ -186,6 +187,12 @@ def update_calibration(
     kept = {name: camera for name, camera in last.cameras.items() if name not in found.cameras and name not in refuted}
     refused = {name: reason for name, reason in found.refused.items() if name not in kept}
     return Update(replace(found, cameras=found.cameras | kept, refused=refused), moved)
+
+
+def _other_images(prepared: PreparedSession, reconstruction: Reconstruction, new: list[str]) -> dict[str, str]:
+    """Of the cameras that were not placed, what their images would have to be to fit, where they would."""
+    left = [name for name in new if name in prepared.cameras and name not in reconstruction.names]
+    return {name: reason for name in left if (reason := other_image(prepared.cameras[name], reconstruction))}
 
 
 def _waits(before: str) -> str:

@@ -152,7 +152,7 @@ def calibrate(
         if not (moves := moves_of_two(solution.prepared, maps, observations, online)):
             report("covariances", 0.95)
             calibration = assemble_calibration(rig, solution, refine_lenses=refine_lenses, online=online)
-            _check(calibration, rig, observations, again if may_move else None)
+            _check(calibration, rig, observations, again if may_move or online else None)
             return calibration
     except Refused as refusal:
         if may_move and (found := _between_settings(prepared.cameras, observations, again)):

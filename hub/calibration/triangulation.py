@@ -68,11 +68,14 @@ def _triangulate(
     report("smoothing the tracks", 0.1)
     lenses = {name: replace(rig.cameras[name], intrinsics=camera.intrinsics) for name, camera in known.items()}
     prepared = prepare(replace(rig, cameras=lenses), observations)
-    unused = dict(prepared.refused) | _unshared(prepared, known)
+    apart = _unshared(prepared, known)
+    unused = dict(prepared.refused) | apart
     names = [name for name in prepared.cameras if name not in unused]
     while True:
         if len(names) < 2:
-            raise Refused(_too_few_cameras(names, unused), unused)
+            refusal = Refused(_too_few_cameras(names, unused), unused)
+            refusal.permanent = bool(apart)
+            raise refusal
         if coincide(*(known[name].pose.position for name in names)):
             raise Refused(f"the cameras {', '.join(names)} are in one place: their rays meet nowhere else", unused)
         report("adjusting the trajectories", 0.4)

@@ -22,6 +22,7 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder, rig_camera_from_info
+from protocols.session.folder import column_warnings
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -146,7 +147,7 @@ def session_from_messages(
     """The session that a hub would have after the messages of a log, its cameras' external clock priors, and warnings.
 
     Times of arrival are not used: a log of other makers holds whatever they wrote. Raises Refused where there is
-    nothing to calibrate from.
+    nothing to calibrate from, and InputError for rows that are no pixels of their images.
     """
     stream = ObservationStream()
     for message in messages:
@@ -163,7 +164,7 @@ def session_from_messages(
     alarms = tuple(
         f"{text}: its rows on one side of that were left out" for text in stream.clocks.alarms.values() if of_marker
     )
-    return rig, observations, priors, alarms + stream.marker.warnings
+    return rig, observations, priors, alarms + stream.marker.warnings + column_warnings(rig, observations)
 
 
 def without_tracked(message: pb.Observation) -> pb.Observation:

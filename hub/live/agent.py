@@ -12,6 +12,7 @@ from contextlib import ExitStack, closing
 
 from google.protobuf.message import Message
 
+from hub.calibration.resection.unconnected import listed
 from hub.distributed.network.host import ROLE as NODES
 from hub.live.fair_share import FairShare
 from hub.live.live_hub import SILENT_S, LiveHub
@@ -140,7 +141,9 @@ class _HubAgent:
             self._publishers |= {"calibration": self._publishers["Calibration"], "track": self._publishers["Track"]}
         self._smoothed = self._publisher(TRACK_SMOOTHED)
         self._node_publishers: dict[str, Publisher] = {}
-        self._orders = stack.enter_context(closing(CommandSubscription(bus, agent, boot, ("recalibrate", "export"))))
+        self._orders = stack.enter_context(
+            closing(CommandSubscription(bus, agent, boot, ("recalibrate", "forget", "export")))
+        )
         self._watch = None if hub.nodes is None and shard is None else stack.enter_context(closing(bus.watch_agents()))
         stack.enter_context(bus.announce(ROLE, agent, boot))
         if hub.nodes is not None:
@@ -189,6 +192,9 @@ class _HubAgent:
             if action == "recalibrate":
                 self._hub.reset()
                 self._last_action = "recalibrating, as requested"
+            elif action == "forget":
+                names = self._hub.forget_silent(time.monotonic())
+                self._last_action = f"forgot {listed(names)}" if names else "no silent camera to forget"
             elif action == "export":
                 self._last_action = "no folder to export to: set out" if export is None else export(self._hub)
 

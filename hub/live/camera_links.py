@@ -43,6 +43,12 @@ class CameraLinks:
         self._windows: dict[str, tuple[int, float, pb.Observation]] = {}
         """Frames, first arrival [s] and the frame that arrived then."""
 
+    def forget(self, camera: str) -> None:
+        """Forget a camera, as if it had never been heard of."""
+        for of_camera in (self.last_frame, self.delays, self.camera_time, self.notices, self.standing, self._windows):
+            of_camera.pop(camera, None)
+        self.fresh.discard(camera)
+
     def receive(self, message: pb.Observation, now: float, arrival: float | None, *, backlog: bool) -> None:
         """Note a frame; arguments as of ``LiveHub.handle``."""
         camera = message.camera

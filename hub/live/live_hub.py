@@ -33,6 +33,7 @@ from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import LONG_FILM_S, SessionBuilder
 from protocols.session.calibration import Calibration, CameraCalibration, stated_calibration, stated_up
+from protocols.session.folder import pixel_faults, small_pictures
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -47,6 +48,7 @@ _BEHIND_S = 10.0
 SILENT_S = 3.0
 """A camera without a frame for longer than this degrades the hub."""
 _VERIFY_EVERY_S = 0.5  # s: between two tests of a reloaded answer
+_CHECK_EVERY_S = 60.0  # s: between two tests of a given calibration, which take a second or two
 _BUDGET_NOTICE_S = 10.0
 """How long the status names a camera that exceeded its budget."""
 _MAX_STD_GROWTH = 1.5
@@ -131,6 +133,9 @@ class LiveHub:
         self.session: tuple[Rig, Observations] | None = None
         self.refusal: Refused | None = None
         self.solver_failure = ""
+        self._next_check, self._known_faults = 0.0, list[str]()
+        self._pixel_faults: dict[str, str] = {}
+        """By camera, why its rows are not used; by "", what is to be checked of all of them."""
         self.calibrated_at = self._now
         """When the present calibration was estimated or, of a given one, began to be used."""
         self._solved_boot_ids: dict[str, str] = {}
@@ -205,6 +210,28 @@ class LiveHub:
         if self.calibration is not None:
             kept = {name: one for name, one in self.calibration.cameras.items() if name not in cameras}
             self.calibration = replace(self.calibration, cameras=kept) if len(kept) > 1 else None
+
+    def forget_silent(self, now: float) -> list[str]:
+        """Forget the cameras that send no frames, as those that were taken away or renamed; their names, in order.
+
+        A given calibration is kept as it is, and so are the cameras that hubs share.
+        """
+        silent = [name for name, age in self.frame_ages(now).items() if age > SILENT_S]
+        heard = {*self.stream.marker.cameras, *(() if self.calibration is None else self.calibration.cameras)}
+        names = sorted({*silent, *(heard - self.links.last_frame.keys())})
+        if self._known is not None or self.is_shard or not names:
+            return []
+        self._superseded, self._answer_rows, self._reloaded = self._jobs, 0.0, None  # they may be in a job under way
+        self.release(names)
+        for name in names:
+            self.guidance.forget(name)
+            self.links.forget(name)
+            self._pixel_faults.pop(name, None)
+        if self.calibration is not None:
+            left = {name: why for name, why in self.calibration.refused.items() if name not in names}
+            self.calibration = replace(self.calibration, refused=left)
+            self._clock_stepped = True  # published with the next tick
+        return names
 
     def adopt(self, calibration: Calibration, boot_ids: Mapping[str, str]) -> None:
         """Go on from another hub's answer, about other cameras than before. boot_ids: of the clocks of its maps."""
@@ -351,7 +378,9 @@ class LiveHub:
             out.append(f"frames left out of {listed(exceeding)}: more than a camera may send")
         if self._schedule.left_out:
             out.append(f"{self._schedule.left_out} is left out: the solver failed with its rows")
-        out += [*self.links.notices.values(), *self.links.standing.values()][:8]
+        out += [*self.links.notices.values(), *self.links.standing.values(), *self._pixel_faults.values()][:8]
+        if self._known_faults:
+            out.append(f"the given calibration: {'; '.join(self._known_faults[:4])}")
         if self.solver.busy and now - self._submitted_at > _BEHIND_S:
             out.append(f"the solver is behind: {now - self._submitted_at:.0f} s for one job")
         return out + [text for text in (self.solver_failure, self.notice) if text]
@@ -364,7 +393,8 @@ class LiveHub:
         out = []
         shared = self.stream.marker.shared_motions_s()
         for name in self.stream.marker.cameras:
-            reason = self.links.standing.get(name) or waiting.get(name, refused.get(name, ""))
+            fault = self.links.standing.get(name) or self._pixel_faults.get(name)
+            reason = fault or waiting.get(name, refused.get(name, ""))
             rows, least = self.stream.marker.rows(name), self.settings.least_rows
             state = "searching" if rows >= least else "collecting"
             if not self.stream.has_info(name):
@@ -398,6 +428,8 @@ class LiveHub:
             return []
         self._schedule.next = now + (_VERIFY_EVERY_S if self.unverified else self.settings.interval_s)
         if self._known is not None:
+            if not final:
+                self._check_known(now)
             return self._publish_present(changed=False)
         if not self.settings.solve:
             return self._use_nodes()
@@ -412,7 +444,7 @@ class LiveHub:
     def _submit(self, now: float, final: bool) -> list[Message]:
         """Hand the present observations to the solver; a final job searches for every camera that is not tied."""
         try:
-            rig, observations = self._build_session()
+            rig, observations = self._without_other_pixels(*self._build_session())
         except Refused as refusal:
             self.refusal = refusal
             return []
@@ -455,6 +487,33 @@ class LiveHub:
         ranges = [one for one in self.stream.marker.ranges() if one[0] in rig.cameras] if self._has_marker() else []
         return self._hand_over(job, boots, ranges, now)
 
+    def _check_known(self, now: float) -> None:
+        """Have the given calibration tested by the present rows, every minute; the answer is for the status."""
+        assert self.calibration is not None
+        rows = [self.stream.marker.rows(name) for name in self.calibration.cameras]
+        if now < self._next_check or not self._has_marker() or sum(count >= VERIFY_ROWS for count in rows) < 2:
+            return
+        self._next_check = now + _CHECK_EVERY_S
+        try:
+            _, observations = self._build_session()
+        except (Refused, InputError):
+            return
+        assert self._rig is not None
+        tracks = {key: one for key, one in observations.tracks.items() if key[0] in self.calibration.cameras}
+        observations = replace(observations, tracks=tracks)
+        self._jobs += 1
+        job = SolverJob(self._jobs, self._rig, observations, self.calibration, verify=True)
+        self._submitted, self._submitted_at, self._submitted_boots = job, now, {}
+        self.solver.submit(job, now)
+
+    def _take_check(self, answer: SolverAnswer) -> None:
+        """What the present rows say of the given calibration; that they say too little is no news."""
+        found = answer.calibration
+        if found is None:
+            self._known_faults = [answer.reason] if answer.permanent else []
+            return
+        self._known_faults = [*(f"{name}: {why}" for name, why in found.refused.items()), *found.warnings]
+
     def _hand_over(
         self, job: SolverJob, boots: dict[str, str], ranges: list[tuple[str, str, int, int, int]], now: float
     ) -> list[Message]:
@@ -479,6 +538,9 @@ class LiveHub:
         """Use an answer: the calibration that it gives, or why there is none."""
         job, boots = self._submitted, self._submitted_boots
         self._submitted = None
+        if self._known is not None:
+            self._take_check(answer)
+            return []
         tied, cameras = (len(one.cameras) if one else 0 for one in (self.calibration, job and job.rig))
         self._schedule.pause(self._submitted_at, answer.cpu_s, calibrated=2 * tied > cameras)
         if job is None or answer.number <= self._superseded:
@@ -592,6 +654,20 @@ class LiveHub:
         """The rig and the observations: of the marker or, if there is none, of people."""
         rig, observations = self.stream.build(self._has_marker() or not self.settings.solve)
         return merge_rigs(rig, self._rig), observations
+
+    def _without_other_pixels(self, rig: Rig, observations: Observations) -> tuple[Rig, Observations]:
+        """The session without the cameras whose rows are no pixels of their images. Raises Refused without two others.
+
+        Their rows would make the answer wrong, or the camera be waited for without end.
+        """
+        faults = self._pixel_faults = {name: str(one) for name, one in pixel_faults(rig, observations).items()}
+        for name in faults:
+            rig, observations = without_camera(rig, observations, name)
+        if faults and len(observations.cameras) < 2:
+            raise Refused("fewer than two cameras have pixels of their images", dict(faults))
+        if small := small_pictures(rig, observations):
+            self._pixel_faults = {**faults, "": small}
+        return rig, observations
 
     def _source(self) -> SessionBuilder | PeopleTracklets:
         return self.stream.marker if self._has_marker() else self.stream.people

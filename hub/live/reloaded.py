@@ -58,7 +58,8 @@ class ReloadedCalibration:
                 name: on_new_clock(
                     camera,
                     shifts[name] - shifts[last.reference],
-                    self.arrival - self.delays[name] - links.camera_time[name],
+                    then=self.arrival - self.delays[name],
+                    now=links.camera_time[name],
                 )
                 for name, camera in fresh.items()
             }
@@ -73,14 +74,14 @@ class ReloadedCalibration:
         return self.since is None or now - self.since > _VERIFY_S
 
 
-def on_new_clock(camera: CameraCalibration, shift: float, elapsed: float) -> CameraCalibration:
+def on_new_clock(camera: CameraCalibration, shift: float, then: float, now: float) -> CameraCalibration:
     """A calibrated camera whose clock, or whose reference camera's, began anew, by delays against the hub's clock.
 
     A camera's delay is the hub's clock less its own. shift: its delay now less then, less the same of the reference
-    camera: what the hub's clock was set by meanwhile cancels. elapsed: its time then less now [s], over which its rate
-    counts. Both differ from the truth by the variation of the network's delays.
+    camera: what the hub's clock was set by meanwhile cancels. then, now: its times [s], between which its rate counts;
+    the lag is that of now. Both differ from the truth by the variation of the network's delays.
     """
     rate = camera.time_map.clock_rate
-    offset = camera.time_map.time_offset + shift + (rate - 1.0) * elapsed
+    offset = camera.time_map.time_offset + shift + (rate - 1.0) * (then - now)
     std = float(np.hypot(camera.time_offset_std, ERROR_BOUND_S))
-    return replace(camera, time_map=TimeMap(rate, offset), time_offset_std=std)
+    return replace(camera, time_map=TimeMap(rate, offset), time_offset_std=std, lag_time=now, lag_std=std)

@@ -146,4 +146,5 @@ def _verified(job: SolverJob) -> Calibration:
         job.last.solver,
         job.last.version,
         refused=dict(found.unused),
+        warnings=found.warnings,
     )

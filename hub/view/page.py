@@ -23,12 +23,14 @@ ACTIONS = {
     "start_recording": "Start recording",
     "stop_recording": "Stop recording",
     "recalibrate": "Recalibrate",
+    "forget": "Forget silent cameras",
     "export": "Export",
 }
 _HINTS = {
     "start_recording": "Every recorder of the site starts a new log.",
     "stop_recording": "Every recorder of the site closes its log.",
     "recalibrate": "The hub discards its observations and starts again, for example after a camera was moved.",
+    "forget": "The hub no longer waits for cameras that were taken away or renamed. One that returns is located anew.",
     "export": "The hub writes its files now, and your browser downloads calibration.toml.",
 }
 

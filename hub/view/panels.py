@@ -33,7 +33,7 @@ _STYLE = (
     ".sl table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}"
     ".sl th{text-align:right;font-weight:600;padding:1px 4px;border-bottom:1px solid #888;white-space:nowrap}"
     ".sl td{text-align:right;padding:1px 4px;white-space:nowrap}"
-    ".sl td:first-child,.sl th:first-child{text-align:left}"
+    ".sl td:first-child,.sl th:first-child{text-align:left;white-space:normal;overflow-wrap:anywhere}"
     ".sl .clock td{white-space:normal;padding:0 4px 3px 1.6em;color:#444}"
     ".sl .bad{font-weight:700}.sl p{margin:.35em 0}.sl .grid{font-family:monospace;line-height:1;white-space:pre}"
     ".sl .headline{font-size:15px}.sl .tiles{display:grid;grid-template-columns:repeat(auto-fill,minmax(130px,1fr));"
@@ -53,9 +53,9 @@ def overview(state: ViewState, now: float) -> str:
     if problems := state.problems(now):
         lines.append(f"<br><b data-syncline='health'>▲ degraded: {html.escape('; '.join(problems))}</b>")
     lines.append("</p>")
-    lines.append(waiting_html(state))
     if needs_guidance(state):
         lines += [f"<p data-syncline='guide'>☞ {html.escape(step)}</p>" for step in state.next_steps()]
+    lines.append(waiting_html(state))
     for path in list(state.paths.values())[: -_MAX_TRACKS - 1 : -1]:
         words = html.escape(f"{TRACK_SIGNS.get(path.state(now), '?')} {track_text(path, now)}")
         label = html.escape(path.label, quote=True)
@@ -161,12 +161,9 @@ def _clock_row(camera: CameraView) -> str:
         rows.append(f"<td colspan=5 data-progress='{name}'>{html.escape(progress_text(camera))}</td>")
     if found is not None:
         reference = found.time_offset_std == 0.0 and found.time_offset == 0.0
-        clock = (
-            "reference clock"
-            if reference
-            else f"{lag_of(found):+.6f} s ± {1e3 * found.time_offset_std:.3f} ms · "
-            f"{1e6 * (found.clock_rate - 1.0):+.1f} ppm"
-        )
+        std = f" ± {1e3 * found.time_offset_std:.3f} ms" if found.time_offset_std > 0.0 else ""
+        lag = f"{lag_of(found):+.6f} s{std} · {1e6 * (found.clock_rate - 1.0):+.1f} ppm"
+        clock = "reference clock" if reference else lag
         rows.append(f"<td colspan=5 data-clock='{name}'>{clock} · {found.rms_px:.2f} px</td>")
     return "".join(f"<tr class='clock'>{row}</tr>" for row in rows)
 

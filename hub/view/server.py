@@ -46,7 +46,13 @@ _DRAW_S = 0.2  # between two drawings of what does not move
 _PANEL_S = 0.5  # between two updates of the panels' text
 _CONNECTION_S = 1.0  # between two looks whether the router is there
 _UNWATCHED_S = 1.0  # redraw interval without an open browser
-_ROLE_OF_ACTION = {"start_recording": "record", "stop_recording": "record", "recalibrate": "hub", "export": "hub"}
+_ROLE_OF_ACTION = {
+    "start_recording": "record",
+    "stop_recording": "record",
+    "recalibrate": "hub",
+    "forget": "hub",
+    "export": "hub",
+}
 
 
 class ViewServer:
@@ -186,7 +192,7 @@ def commands_for(state: ViewState, action: str, sender: str, boot: str, sequence
 def action_result(state: ViewState, action: str) -> str:
     """The text shown after a click."""
     names = [agent.status.agent for agent in state.of_role(_ROLE_OF_ACTION[action])]
-    action_text = action.replace("_", " ")
+    action_text = ACTIONS[action].lower()
     agent_name = {"record": "recorder", "hub": "hub"}[_ROLE_OF_ACTION[action]]
     return (
         f"requested from {', '.join(names)}: {action_text}"

@@ -31,6 +31,7 @@ _PATH_INTERVAL_S = 1 / 30  # between two kept points of a trajectory: tracks com
 _NEW_CLOCK_S = 5.0  # a track that goes back by more is on another clock
 _MAX_PATHS = 48  # tracked people get new labels: the track not updated for longest is dropped
 _MAX_PROBLEMS = 3  # in the headline
+_MAX_ALARM = 300  # characters of the status of an agent that is still starting
 
 CameraState = Literal["calibrated", "degraded", "searching", "collecting", "refused", "silent", "gone"]
 """The hub's word for a camera, or that no frames come."""
@@ -244,7 +245,7 @@ class ViewState:
         refused = sum(camera.verdict == "refused" for camera in self.cameras.values())
         parts = [
             f"{word}: {_counted(len(shown.cameras))}",
-            f"lags ± {1e3 * max(stds, default=0.0):.2g} ms",
+            f"lags ± {1e3 * max(stds):.2g} ms" if any(stds) else "",  # not known, as of other tools' calibrations
             f"{refused} refused" if refused else "",
             found.reason if word == "degraded" else "",
         ]
@@ -261,6 +262,8 @@ class ViewState:
                     out.append(f"{name} has ended" + (f": {status.message}" if status.state == "stopping" else ""))
             elif status.state == "degraded" or (status.state == "stopping" and role == "record"):
                 out.append(f"{name}: {status.message or status.state}")
+            elif status.counters.get("alarms"):  # they come first; a hub that waits says much else
+                out.append(f"{name}: {status.message[:_MAX_ALARM]}")
             elif role != "camera" and now - agent.at > STALE_S:
                 out.append(f"{name} has sent no status for {now - agent.at:.0f} s")
         more = len(out) - _MAX_PROBLEMS
@@ -348,6 +351,7 @@ class ViewState:
                     camera.lags.add(found, clocks, now)
             for name, camera in self.cameras.items():
                 camera.calibration = solved.get(name)
+            self._forget({*solved, *refused, *progress}, now)
         word = _word(message)
         for name in progress:
             self._camera(name)
@@ -364,6 +368,14 @@ class ViewState:
                 camera.verdict = waiting if camera.calibration is None else "calibrated"
             camera.refused = camera.reason if camera.verdict == "refused" else ""
             camera.refusals += camera.verdict == "refused" != was
+
+    def _forget(self, known: set[str], now: float) -> None:
+        """Drop the cameras that send nothing and that the hub no longer speaks of, as it was asked to forget them."""
+        for name, camera in list(self.cameras.items()):
+            if camera.progress is not None and name not in known and camera.state(now) in ("silent", "gone"):
+                del self.cameras[name]
+                self.agents.pop(name, None)
+                self.guidance.forget(name)
 
 
 def _word(message: pb.Calibration) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,8 @@ _REPLACED_METADATA = (
     "reference",
 )  # fmt: skip
 """Metadata keys of rig.toml that the result replaces."""
+_LAG_KEYS = ("lag_time", "lag_std", "clock_rate_std")
+"""What says where a lag's std holds: without them a hub that goes on from the file has a lag of no std."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +155,33 @@ def stated_calibration(rig: Rig, cameras: dict[str, CameraCalibration]) -> Calib
     )
 
 
+def on_present_clock(calibration: Calibration) -> Calibration:
+    """The calibration on the clock of one of its cameras, where the reference camera is none of them any more.
+
+    A hub holds its reference clock when that camera has gone; a file's reference clock has to be one of its cameras'.
+    The new one is the camera whose lag is known best, as of which the others' stds are.
+    """
+    cameras = calibration.cameras
+    if calibration.reference in cameras or not cameras:
+        return calibration
+    name = min(cameras, key=lambda one: cameras[one].time_offset_std)
+    base, std = cameras[name].time_map, cameras[name].time_offset_std
+    moved = {
+        one: replace(
+            camera,
+            time_map=TimeMap(
+                camera.time_map.clock_rate / base.clock_rate,
+                (camera.time_map.time_offset - base.time_offset) / base.clock_rate,
+            ),
+            time_offset_std=float(np.hypot(camera.time_offset_std, std)) if one != name else 0.0,
+            lag_std=float(np.hypot(camera.lag_std, std)) if one != name else 0.0,
+        )
+        for one, camera in cameras.items()
+    }
+    paths = (replace(path, time=(path.time - base.time_offset) / base.clock_rate) for path in calibration.trajectories)
+    return replace(calibration, cameras=moved, reference=name, trajectories=tuple(paths))
+
+
 def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
     """The content of calibration.toml: rig.toml's tables with the estimates added."""
     tables: dict[str, Any] = {}
@@ -170,7 +199,7 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
         table = dict(rig.cameras[name].table) if name in rig.cameras else {}
         # A surveyed position is an input: the estimate is the translation, and two values that differ by the
         # survey's error would contradict each other.
-        for key in ("position", "position_std", "rotation_std", "focal_std", "ball_outline"):
+        for key in ("position", "position_std", "rotation_std", "focal_std", "ball_outline", *_LAG_KEYS):
             table.pop(key, None)
         table |= {
             "name": name,
@@ -183,6 +212,8 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
             "position_std": camera.position_std.tolist(),
             "rms_px": camera.rms_px,
         }
+        if camera.lag_time != 0.0:
+            table |= {key: getattr(camera, key) for key in _LAG_KEYS}
         if camera.focal_std > 0.0:
             table["focal_std"] = camera.focal_std
         if camera.readout != 0.0:
@@ -198,7 +229,7 @@ def calibration_tables(calibration: Calibration, rig: Rig) -> dict[str, Any]:
 
 def calibration_text(calibration: Calibration, rig: Rig) -> str:
     """The text of calibration.toml, which aniposelib loads unchanged."""
-    return tomli_w.dumps(_plain(calibration_tables(calibration, rig)))
+    return tomli_w.dumps(_plain(calibration_tables(on_present_clock(calibration), rig)))
 
 
 def trajectory_text(tables: Sequence[TrajectoryTable], labelled: bool) -> str:
@@ -239,10 +270,12 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
             what = f"[{name}] time_offset {offset!r} and clock_rate {rate!r} are no clock"
             raise InputError(what, file=file, remedy="give a number of seconds, and a rate near 1")
         std = camera.position_std
-        figures = {key: table.get(key, 0.0) for key in ("time_offset_std", "rms_px")}
+        figures = {key: table.get(key, 0.0) for key in ("time_offset_std", "rms_px", *_LAG_KEYS)}
         for key, value in figures.items():
-            if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < np.inf:
-                raise InputError(f"[{name}] {key} is not a number >= 0", file=file, remedy="correct it")
+            least = -np.inf if key == "lag_time" else 0.0
+            if not isinstance(value, int | float) or isinstance(value, bool) or not least <= value < np.inf:
+                what = "a number" if key == "lag_time" else "a number >= 0"
+                raise InputError(f"[{name}] {key} is not {what}", file=file, remedy="correct it")
         cameras[name] = CameraCalibration(
             name=name,
             intrinsics=camera.intrinsics,
@@ -252,6 +285,9 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
             position_std=np.zeros(3) if std is None else std,
             rms_px=float(figures["rms_px"]),
             readout=camera.readout or 0.0,
+            lag_time=float(figures["lag_time"]),
+            lag_std=float(figures["lag_std"]),
+            clock_rate_std=float(figures["clock_rate_std"]),
         )
     return rig, cameras
 

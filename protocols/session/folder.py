@@ -22,6 +22,9 @@ _MANY_TIMES = 10  # distinct ones that are all whole by chance: of stamps in ten
 _MANY_ROWS, _SMALL_PICTURE = 100, 0.55
 """Rows of a camera, and the share of its width and of its height that they reach in every camera: those of pictures of
 half the size reach a half."""
+_FRACTION = 1.0
+"""Greatest distance of fractions of an image from 0.5: beyond its borders too, as people's joints are placed. No target
+stays so near the first pixel."""
 _ENLARGEMENTS = (2, 3, 4)  # whole parts of a picture that detectors are given to save time
 _MAX_OUTSIDE_SHARE, _MAX_INSIDE_SHARE = 0.01, 0.02
 """Share of rows outside the image above which a warning is given, and of these with u and v swapped, for false ones."""
@@ -49,13 +52,14 @@ def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Ob
 
 def column_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
     """Warnings for cameras with many rows outside their image or with times that are frame numbers or milliseconds, and
-    for pixels of smaller images. Raises InputError for u and v swapped and for pixels of larger images."""
+    for pixels of smaller images. Raises InputError for the first of `pixel_faults`."""
+    for fault in pixel_faults(rig, observations).values():
+        raise fault
     warnings = []
     for name, camera in rig.cameras.items():
         pixels = _pixels(observations, name)
         outside = _outside(pixels, camera.size)
         if outside > _MAX_OUTSIDE_SHARE * len(pixels):
-            _check_axes(name, camera.size, pixels, outside)
             width, height = camera.size
             warnings.append(
                 f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image; check size, u, v"
@@ -66,12 +70,26 @@ def column_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
                 f"{name}: all its times are whole numbers of seconds, though it films {camera.fps:g} frames a second; "
                 "frame numbers have to be divided by the frame rate, milliseconds by 1000"
             )
-    if enlargements(rig, observations):
-        warnings.append(
-            f"every camera's rows lie in the upper left of its picture, within {_reach(rig, observations):.2g} of its "
-            "width and height: were they detected in smaller pictures than rig.toml states, or given as fractions?"
-        )
-    return tuple(warnings)
+    return (*warnings, *([text] if (text := small_pictures(rig, observations)) else []))
+
+
+def small_pictures(rig: Rig, observations: Observations) -> str:
+    """Warning where every camera's rows are as those of smaller images; "" elsewhere."""
+    if not enlargements(rig, observations):
+        return ""
+    return (
+        f"every camera's rows lie in the upper left of its picture, within {_reach(rig, observations):.2g} of its "
+        "width and height: were they detected in smaller pictures than its size says?"
+    )
+
+
+def pixel_faults(rig: Rig, observations: Observations) -> dict[str, InputError]:
+    """By camera, why its rows are no pixels of its image: fractions of it, u and v swapped, of a larger image."""
+    return {
+        name: fault
+        for name, camera in rig.cameras.items()
+        if (fault := _pixel_fault(name, camera.size, _pixels(observations, name)))
+    }
 
 
 def enlargements(rig: Rig, observations: Observations) -> tuple[int, ...]:
@@ -101,24 +119,30 @@ def _outside(pixels: Floats, size: tuple[int, int]) -> int:
     return int(((pixels < -1.0) | (pixels > np.array(size))).any(axis=1).sum())
 
 
-def _check_axes(name: str, size: tuple[int, int], pixels: Floats, outside: int) -> None:
-    """Raise InputError for pixels (n, 2) that fit the image with u and v swapped, and for those of a larger image."""
+def _pixel_fault(name: str, size: tuple[int, int], pixels: Floats) -> InputError | None:
+    """What is wrong with the pixels (n, 2) of an image."""
     width, height = size
-    many = len(pixels) >= _MANY_ROWS
-    if many and _outside(pixels[:, ::-1], size) < _MAX_INSIDE_SHARE * outside:
-        raise InputError(
-            f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image, and none with u and v "
-            "swapped",
-            remedy="swap the columns u and v, or width and height in rig.toml's size",
+    if len(pixels) < _MANY_ROWS:
+        return None
+    if width * height > 1 and (np.abs(pixels - 0.5) <= _FRACTION).all():
+        return InputError(
+            f"{name}: all of its {len(pixels)} rows lie within one pixel of the first of its {width}x{height} image: "
+            "they are fractions of it",
+            remedy="multiply u by its width and v by its height",
         )
-    if not many or outside <= _MANY_OUTSIDE_SHARE * len(pixels):
-        return
-    if (np.quantile(pixels, 0.99, axis=0) > _LARGE_PICTURE * np.array(size)).all():
-        raise InputError(
-            f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image, at the right and below: "
-            "they are pixels of a larger one",
-            remedy="correct size and matrix in rig.toml, or scale u and v",
+    outside = _outside(pixels, size)
+    if outside <= _MAX_OUTSIDE_SHARE * len(pixels):
+        return None
+    rows = f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image"
+    if _outside(pixels[:, ::-1], size) < _MAX_INSIDE_SHARE * outside:
+        return InputError(f"{rows}, and none with u and v swapped", remedy="swap u and v, or width and height in size")
+    many = outside > _MANY_OUTSIDE_SHARE * len(pixels)
+    if many and (np.quantile(pixels, 0.99, axis=0) > _LARGE_PICTURE * np.array(size)).all():
+        return InputError(
+            f"{rows}, at the right and below: they are pixels of a larger one",
+            remedy="correct size and matrix, or scale u and v",
         )
+    return None
 
 
 def write_rig(file: Path, tables: dict[str, Any]) -> None:

@@ -32,6 +32,7 @@ __all__ = [
     "message_class",
     "parse_key",
     "sender",
+    "unknown_key",
 ]
 
 MAX_PAYLOAD = 1024 * 1024
@@ -74,6 +75,11 @@ def parse_key(key: str) -> Address | None:
             agent = name_of_segment(found[2])
             return None if agent is None else Address(found[1], topic, agent)
     return None
+
+
+def unknown_key() -> Rejected:
+    """The rejection of a message whose key `parse_key` does not know."""
+    return Rejected(RejectionReason.UNKNOWN_KEY, "no topic has this key, or its id is not usable as a name")
 
 
 def message_class(topic: Topic) -> type[Message]:
@@ -142,7 +148,7 @@ def admit(key: str, payload: bytes) -> tuple[Address, Message]:
             pass
     address = parse_key(key)
     if address is None:
-        raise Rejected(RejectionReason.UNKNOWN_KEY, key[:200])
+        raise unknown_key()
     message = decode(address.topic, payload)
     claimed = message.camera if isinstance(message, pb.Observation) else sender(message)
     if claimed is not None and claimed != address.agent:

@@ -117,7 +117,7 @@ def _id(text: str, field: str, *, optional: bool = False) -> None:
     try:
         check_identifier(text, field)
     except InputError as error:
-        raise Rejected(RejectionReason.BAD_ID, error.what) from None
+        raise Rejected(RejectionReason.BAD_ID, f"{error.what}: {error.remedy}") from None
 
 
 def _text(text: str, name: str, most: int = MAX_TEXT) -> None:
@@ -492,7 +492,7 @@ def _shard(message: pb.Shard) -> None:
         _number(overlap.seconds, "seconds", 0.0, MAX_TIME_S)
 
 
-ACTIONS = frozenset({"start_recording", "stop_recording", "recalibrate", "export"})
+ACTIONS = frozenset({"start_recording", "stop_recording", "recalibrate", "forget", "export"})
 MAX_PICTURE = 512 * 1024  # bytes of a thumbnail
 
 

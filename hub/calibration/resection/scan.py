@@ -43,6 +43,7 @@ _MIN_COMMON_S = 3.0
 _SCALES = [np.array([mirror * scale, scale]) for mirror in (1.0, -1.0) for scale in np.geomspace(0.5, 2.0, 17)]
 """Scales of an image about its centre, mirrored or not, that are tried where a camera fits at no lag: no view is so
 wide or narrow that a lens is mistaken by more."""
+_SMALLER_IMAGES = (2, 3, 4)  # whole parts of a picture that detectors are given to save time
 _SCALE_STEPS = (1.04, 1.02, 1.01, 1.005)  # half of the step of _SCALES, then half of that, and so on
 LIKELY_CANDIDATES, _MIN_SCALE_CHANGE = 4, 0.03
 """Candidates of the moment scan, which does not use the lens, whose scale is searched; scale that the lens gives."""
@@ -180,8 +181,7 @@ def find_time_map(
     nominal = sorted(moment_scan(labels, moments, rates[0]), key=lambda one: one.score)
     verified = [verify(one, samples, camera) for one in nominal[:LIKELY_CANDIDATES]]
     if verified and _misfit(verified):
-        likely = nominal[:LIKELY_CANDIDATES]
-        reason = _other_image([verify(one, samples, camera, _SCALES) for one in likely])
+        reason = _other_image(camera, samples, nominal[:LIKELY_CANDIDATES], verified)
         if reason:
             return None, reason
     found = [candidate for rate in rates[1:] for candidate in moment_scan(labels, moments, rate)]
@@ -404,10 +404,36 @@ def _misfit(verified: list[_Verified]) -> str:
     return ""
 
 
-def _other_image(verified: list[_Verified]) -> str:
-    """What is wrong with a camera whose image fits by far best at another scale than its lens's; "" if none fits."""
-    scale = _best_and_next(verified)[0].scale
-    if _misfit(verified) or abs(scale[0] - 1.0) < _MIN_SCALE_CHANGE:
+def other_image(camera: CameraInput, reconstruction: Reconstruction) -> str:
+    """What is wrong with a camera that was not accepted, if with another lens, or as another image, it fits the path of
+    the others; else ""."""
+    labels = seen_labels(camera, reconstruction)
+    if not labels:
+        return ""
+    samples = [(one, *along_path(one.track)) for one in labels]
+    likely = sorted(moment_scan(labels, path_moments(labels), 1.0), key=lambda one: one.score)[:LIKELY_CANDIDATES]
+    return _other_image(camera, samples, likely, [verify(one, samples, camera) for one in likely]) if likely else ""
+
+
+def _other_image(
+    camera: CameraInput, samples: list[Sample], likely: list[TimeMapCandidate], verified: list[_Verified]
+) -> str:
+    """What is wrong with a camera whose image fits by far best at another scale than its lens's; "" if none fits.
+
+    verified: the ``likely`` candidates with the lens as it is given.
+    """
+    for factor in _SMALLER_IMAGES:
+        shift = (factor - 1.0) * camera.intrinsics.matrix[:2, 2] / np.diag(camera.intrinsics.matrix)[:2]
+        enlarged = [(label, time, factor * points + shift) for label, time, points in samples]
+        if not _misfit([verify(one, enlarged, camera) for one in likely]):
+            return (
+                f"its rows are pixels of pictures of 1/{factor} the size: so they fit the path that the others agree on"
+            )
+    if not _misfit(verified):
+        return ""
+    scaled = [verify(one, samples, camera, _SCALES) for one in likely]
+    scale = _best_and_next(scaled)[0].scale
+    if _misfit(scaled) or abs(scale[0] - 1.0) < _MIN_SCALE_CHANGE:
         return ""
     if scale[0] < 0.0:
         return "its image is mirrored: so it fits the path that the others agree on"

@@ -32,6 +32,9 @@ _MAX_SOURCES = _MAX_AGENTS = 4 * MAX_CAMERAS  # of a hub: invented names cannot 
 _MAX_HEARD = 16
 """Boots of one agent whose late messages are accepted, and that may be alive at once."""
 _PUBLISHED_SOURCES = 48  # of rejections in a status, whose counters are bounded
+_NAMED_SOURCES = 3  # of messages that are not usable, in its text
+_OF_SENDER = {RejectionReason.SECOND_AGENT.value, RejectionReason.WRONG_SOURCE.value}
+"""Reasons that are no fault of a message: the first has an alarm, the other one ends by itself after a restart."""
 _SHARING = ("nodes", "shard")  # roles of hubs that calibrate one site together
 _MAX_COUNTER_NAME = 64  # characters: the validation's limit
 
@@ -209,6 +212,8 @@ class SenderCheckedBus(Closing):
         self.guard = SenderValidator()
         self._watch: AgentWatch | None = None
         self._by_source: Counter[tuple[str, str]] = Counter()
+        self._unusable: dict[str, tuple[float, Refusal]] = {}
+        """By agent, or key of none: when its last message was that could not be used [s], and why."""
 
     @property
     def site(self) -> str:
@@ -256,6 +261,9 @@ class SenderCheckedBus(Closing):
         if (refusal.reason, source) not in self._by_source and len(self._by_source) >= _MAX_SOURCES:
             source = "others"
         self._by_source[refusal.reason, source] += 1
+        who = refusal.agent or refusal.key
+        if refusal.reason not in _OF_SENDER and (who in self._unusable or len(self._unusable) < _MAX_SOURCES):
+            self._unusable[who] = self.now(), refusal
         self._refused(refusal)
 
     def refusals_by_source(self) -> dict[tuple[str, str], int]:
@@ -270,7 +278,7 @@ class SenderCheckedBus(Closing):
         for (reason, source), count in self._by_source.most_common(_PUBLISHED_SOURCES):
             if len(whole.counters) < MAX_NUMBERS:
                 whole.counters[f"rejected.{reason}@{source}"[:_MAX_COUNTER_NAME]] = count
-        alarms = self.guard.alarms()
+        alarms = [*self.guard.alarms(), *self._unusable_alarms()]
         if alarms:
             whole.counters["alarms"] = len(alarms)
             whole.message = "; ".join([*alarms, whole.message])[:1000]
@@ -279,3 +287,14 @@ class SenderCheckedBus(Closing):
         self._amend(whole)
         self._seen(whole)
         return whole
+
+    def _unusable_alarms(self) -> list[str]:
+        """Who sends messages that cannot be used, and why: it would only be missing, or silent, without a reason."""
+        now = self.now()
+        self._unusable = {who: one for who, one in self._unusable.items() if now - one[0] < SOURCE_TIMEOUT_S}
+        out = [
+            f"messages of {who} are not used: {refusal.detail or refusal.reason}"
+            for who, (_, refusal) in sorted(self._unusable.items())
+        ]
+        more = len(out) - _NAMED_SOURCES
+        return [*out[:_NAMED_SOURCES], f"messages of {more} more are not used"] if more > 0 else out

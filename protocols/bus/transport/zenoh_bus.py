@@ -25,7 +25,7 @@ from protocols.bus.transport.session import close_session, open_session, undecla
 from protocols.core.closing import Closing
 from protocols.core.names import check_identifier
 from protocols.topics import Delivery, Topic, liveliness_key
-from protocols.validation.codec import Rejected, RejectionReason, encode, message_class, parse_key
+from protocols.validation.codec import encode, message_class, parse_key, unknown_key
 
 HEARTBEAT_S = 0.5
 """Period after which a subscriber detects that the last message before a pause is missing."""
@@ -201,7 +201,7 @@ class ZenohSubscription(InboxSubscription):
         source, key = sample.source_info, str(sample.key_expr)
         if key not in self._keys.met:
             if parse_key(key) is None:  # nothing is remembered of it
-                self.inbox.refuse(Rejected(RejectionReason.UNKNOWN_KEY, key[:200]), key)
+                self.inbox.refuse(unknown_key(), key)
                 return None
             self._keys.meet(key)
         if source is None:

@@ -79,11 +79,15 @@ class LogWriter(Closing):
             enable_data_crcs=True,
         )
         self._chunk = faster(self._writer)
-        with self._disk():
-            self._writer.start(profile=PROFILE, library=LIBRARY)
-            self._writer.add_metadata(FORMAT_RECORD, _format(part, schema))
-            for name, values in (metadata or {}).items():
-                self._writer.add_metadata(name, dict(values))
+        try:
+            with self._disk():
+                self._writer.start(profile=PROFILE, library=LIBRARY)
+                self._writer.add_metadata(FORMAT_RECORD, _format(part, schema))
+                for name, values in (metadata or {}).items():
+                    self._writer.add_metadata(name, dict(values))
+        except InputError:  # on a full disk a recorder that tries again would leave one empty file after the other
+            self.path.unlink(missing_ok=True)
+            raise
 
     @property
     def size(self) -> int:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from google.protobuf.message import Message
 
+from deploy.agents.answer_store import AnswerStore
+from deploy.agents.assembly import write_last
 from hub.live.agent import status_message
-from hub.live.live_hub import LiveHub, LiveSettings
+from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
 from hub.live.solver import InlineSolver, SolverAnswer, SolverJob
-from protocols.core.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.ranges import MAX_DISTORTION
+from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
+from protocols.session.calibration import read_calibration
 from tests.support.rigs import Session, simulate
 from tests.support.session_messages import info_messages, row_messages
 
@@ -177,6 +183,48 @@ def test_a_lens_that_cannot_be_costs_only_its_camera(session: Session) -> None:
     assert set(hub.calibration.cameras) == {"cam0", "cam1"}
 
 
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda u, v: (u / 1280, v / 720), "fractions of it; multiply u by its width"),
+        (lambda u, v: (v, u), "swap u and v"),
+        (lambda u, v: (2 * u, 2 * v), "pixels of a larger one"),
+        (lambda u, v: (u / 2, v / 2), "its rows are pixels of pictures of 1/2 the size"),
+        (lambda u, v: (u, 719 - v), "its image is mirrored"),
+    ],
+)
+def test_a_camera_whose_pixels_are_of_another_image_is_named(
+    change: Callable[[float, float], tuple[float, float]], reason: str
+) -> None:
+    """Such cameras were told to wave the ball elsewhere, or that they fit at no lag yet."""
+    session = simulate(3, 4, 30.0)
+    stream = messages(session)
+    for message in stream:
+        if message.camera == "cam3" and isinstance(message, pb.Observation):  # type: ignore[attr-defined]
+            one = message.detections[0]
+            one.u, one.v = change(one.u, one.v)
+    hub = LiveHub(SETTINGS)
+    feed(hub, stream)
+    assert hub.calibration is not None
+    assert set(hub.calibration.cameras) == {"cam0", "cam1", "cam2"}
+    assert reason in next(one.reason for one in hub.progress() if one.camera == "cam3")
+
+
+def test_pictures_of_another_size_are_refused_by_a_hub_too() -> None:
+    """Half the pixels of all cameras gave an answer of two of them, with a clock step that none had."""
+    stream = messages(simulate(3, 4, 30.0))
+    for message in stream:
+        for one in message.detections if isinstance(message, pb.Observation) else ():
+            one.u, one.v = one.u / 2, one.v / 2
+    hub = LiveHub(SETTINGS)
+    feed(hub, stream)
+    assert hub.calibration is None
+    state, text = hub.state(1e6)
+    assert state == "searching"
+    assert "upper left of its picture" in text
+    assert "as those of pictures of 1/2 the size" in text
+
+
 def test_a_repeated_time_stamp_does_not_refuse_the_session_of_a_log(session: Session) -> None:
     """Two frames of one time, or of one number, refused all cameras."""
     builder = SessionBuilder()
@@ -231,6 +279,99 @@ class RefusingSolver(InlineSolver):
 
     def submit(self, job: SolverJob, now: float) -> None:
         self._answer = SolverAnswer(job.number, reason="no two cameras", refused={"cam1": "only 10 % fit"})
+
+
+@pytest.mark.parametrize("gone", ["cam0", "cam2"])
+def test_a_camera_that_was_taken_away_is_forgotten_on_request(session: Session, gone: str, tmp_path: Path) -> None:
+    """One renamed or removed kept the hub degraded for ever. cam0 is the reference."""
+    stream = messages(session)
+    hub = LiveHub(SETTINGS)
+    half = len(stream) // 2
+    for number, message in enumerate(stream[:half]):
+        hub.handle(message)
+        if number % 100 == 99:
+            hub.tick(0.01 * number)
+    assert hub.calibration is not None
+    before = hub.calibration.cameras
+    assert set(before) == {"cam0", "cam1", "cam2"}
+    now = 0.01 * half
+    assert hub.forget_silent(now) == [], "none is silent"
+    rest = [message for message in stream[half:] if message.camera != gone]  # type: ignore[attr-defined]
+    for number, message in enumerate(rest):
+        hub.handle(message)
+        if number % 100 == 99:
+            hub.tick(now + 0.01 * number)
+    now += 0.01 * len(rest)
+    assert hub.state(now)[0] == "degraded"
+    assert hub.forget_silent(now) == [gone]
+    assert hub.state(now)[0] == "calibrated"
+    (published, *_) = calibrations(hub.tick(now))
+    assert gone not in [one.camera for one in (*published.cameras, *published.progress, *published.refused)]
+    hub.tick(now + 5.0, final=True)
+    hub.tick(now + 6.0)
+    assert set(hub.calibration.cameras) == set(before) - {gone}
+    for name, camera in hub.calibration.cameras.items():  # on the clock and in the world of before
+        at = before[name].lag_time
+        shift = (camera.time_map.clock_rate - before[name].time_map.clock_rate) * at
+        assert abs(shift + camera.time_map.time_offset - before[name].time_map.time_offset) < 1e-3
+    assert not any(gone in one.text for one in hub.guidance.advice(9))
+    assert hub.session is not None
+    store = AnswerStore(tmp_path)
+    store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.links.delays)
+    store.close()
+    kept = AnswerStore(tmp_path).load()
+    assert kept is not None, "a reference camera that is not in it made the file unreadable"
+    for name, camera in kept[0].cameras.items():
+        assert abs(session.clock_error(name, kept[0].reference, camera.time_map)) < 1e-3
+        assert (camera.time_offset_std > 0.0) == (name != kept[0].reference)
+    write_last(hub, tmp_path / "out")
+    _, written = read_calibration(tmp_path / "out" / "calibration.toml")
+    path = np.loadtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", skiprows=1, usecols=0)
+    spans = [written[name].time_map.reference_from_camera(CameraTime(written[name].lag_time)) for name in written]
+    assert all(path[0] < span < path[-1] for span in spans)
+
+
+@pytest.mark.parametrize(
+    ("pose", "clock", "scale", "said"),
+    [
+        (lambda pose: pose, 0.0, "arbitrary", ""),
+        (
+            lambda pose: Pose(pose.rotation.T, -pose.rotation @ pose.position),
+            0.0,
+            "arbitrary",
+            "rotation and translation are world from",
+        ),
+        (lambda pose: pose, 1e4, "arbitrary", "was its clock set anew?"),
+        (lambda pose: Pose(pose.rotation, 2000.0 * pose.position), 0.0, "metric", "seem not to be in m"),
+    ],
+)
+def test_a_given_calibration_that_the_rows_contradict_is_named(
+    session: Session, pose: Callable[[Pose], Pose], clock: float, scale: str, said: str
+) -> None:
+    """A hub with one of another convention, unit or run of the cameras was `calibrated`, and tracked nobody."""
+    stream = messages(session)
+    hub = LiveHub(SETTINGS)
+    feed(hub, stream)
+    assert hub.calibration is not None
+    assert hub.session is not None
+    cameras = {
+        name: replace(camera, pose=pose(camera.pose)) if clock == 0.0 else camera
+        for name, camera in hub.calibration.cameras.items()
+    }
+    if clock:
+        for number, (name, camera) in enumerate(cameras.items()):
+            one = camera.time_map
+            cameras[name] = replace(camera, time_map=replace(one, time_offset=one.time_offset + clock * number))
+    metadata = {"reference": hub.calibration.reference, "scale": scale}
+    given = LiveHub(SETTINGS, known=KnownCalibration(replace(hub.session[0], metadata=metadata), cameras))
+    assert given.state(0.0)[0] != "refused"
+    for number, message in enumerate(stream):
+        given.handle(message)
+        if number % 200 == 199:
+            given.tick(0.01 * number)
+    state, text = given.state(0.01 * len(stream))
+    assert state == ("degraded" if said else "calibrated"), text
+    assert said in text
 
 
 def test_an_answer_that_the_newest_rows_contradict_is_kept_and_the_hub_says_so(session: Session) -> None:

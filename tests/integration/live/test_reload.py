@@ -68,6 +68,12 @@ def test_a_killed_hub_tracks_again_within_seconds(session: Session, kept: Path) 
     hub = restarted(kept)
     first = next(one for one in play(hub, session, 18.0, 18.5) if one.status == "solved")
     assert first.state == "degraded"
+    last = AnswerStore(kept).load()
+    assert last is not None
+    for one in first.cameras:
+        camera = last[0].cameras[one.camera]
+        assert 0.0 < abs(one.lag_time_s) == abs(camera.lag_time)
+        assert (one.time_offset_std > 0.0) == (one.camera != last[0].reference), "a lag is shown where its std holds"
     assert hub.unverified
     assert "not verified" in hub.state(18.5)[1]
     play(hub, session, 18.5, 22.0)
@@ -148,6 +154,9 @@ def test_after_a_power_cut_the_last_answer_holds_on_new_clocks_if_it_is_configur
     first = next(one for one in play(hub, session, 18.0, 18.5) if one.status == "solved")
     assert {camera.camera for camera in first.cameras} == set(before)
     assert first.state == "degraded"
+    for one in first.cameras:
+        assert abs(one.lag_time_s - hub.links.camera_time[one.camera]) < 1.0, "on its new clock"
+        assert one.time_offset_std >= 1e-3, "no better than the delays"
     assert "not verified" in hub.state(18.5)[1]
     play(hub, session, 18.5, 22.0)
     assert hub.counters["verified"] == 1

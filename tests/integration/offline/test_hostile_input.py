@@ -199,7 +199,8 @@ def test_a_time_or_pixel_beyond_all_measure_is_bad_input(tmp_path: Path, row: st
 @pytest.mark.parametrize(
     ("change", "status", "report"),
     [
-        (lambda pixels: pixels[:, ::-1], 2, "swap the columns u and v"),
+        (lambda pixels: pixels[:, ::-1], 2, "swap u and v"),
+        (lambda pixels: pixels / [1280, 720], 2, "they are fractions of it; multiply u by its width"),
         (lambda pixels: 1.5 * pixels, 2, "pixels of a larger one"),
         (lambda pixels: 0.5 * pixels, 3, "pictures of 1/2 the size that rig.toml states, the rows place 4 cameras"),
         (lambda pixels: pixels / 3, 3, "pictures of 1/3 the size"),

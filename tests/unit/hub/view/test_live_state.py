@@ -228,6 +228,12 @@ def test_an_ailing_agent_is_in_the_headline_within_five_seconds() -> None:
         ill.state = "running"
         state.handle(ill, 1.2)
         assert state.problems(1.3) == []
+        ill.state = "starting"
+        ill.counters["alarms"] = 1
+        state.handle(ill, 1.3)
+        assert state.problems(1.3) == [f"{agent}: too <hot>"]
+        ill.counters.pop("alarms")
+        state.handle(ill, 1.4)
     state.handle(observation("cam0", 1), 6.0)
     assert state.problems(6.5) == ["hub has sent no status for 5 s", "rec has sent no status for 5 s"]
     state.presence("hub", "hub", alive=False, boot="boot-1")

@@ -153,6 +153,25 @@ def test_times_are_short() -> None:
     assert ago(0.0, 600.0) == "10\u2009min"
 
 
+def test_a_silent_camera_that_the_hub_has_forgotten_leaves_the_page() -> None:
+    state = ViewState()
+    for name in ("cam0", "cam1", "cam2"):
+        state.handle(observation(name), 0.0)
+    message = calibration()
+    for name in ("cam0", "cam1"):
+        message.progress.add(camera=name, state="calibrated")
+    state.handle(message, 0.0)
+    message.revision += 1
+    del message.progress[:], message.cameras[:]
+    state.handle(message, 0.1)
+    assert set(state.cameras) == {"cam0", "cam1", "cam2"}, "they send frames"
+    message.progress.add(camera="cam1", state="degraded")
+    state.cameras["cam0"].progress = message.progress[0]
+    state.handle(message, 60.0)
+    assert set(state.cameras) == {"cam1", "cam2"}, "the hub has not heard of cam2 yet"
+    assert "cam0" not in " ".join(state.problems(60.0) + state.next_steps())
+
+
 def test_a_click_sends_one_command_to_each_agent_of_the_role() -> None:
     state = ViewState()
     for agent, role, boot in (("rec-a", "record", "b1"), ("rec-b", "record", "b2"), ("hub", "hub", "b3")):
@@ -163,6 +182,8 @@ def test_a_click_sends_one_command_to_each_agent_of_the_role() -> None:
     assert [(c.agent, c.agent_boot, c.sequence) for c in commands] == [("rec-a", "b1", 4), ("rec-b", "b2", 5)]
     assert all(encode(command) for command in commands)
     assert commands_for(state, "recalibrate", "view-1", "boot", 0)[0].agent == "hub"
+    assert commands_for(state, "forget", "view-1", "boot", 0)[0].action == "forget"
+    assert action_result(state, "forget") == "requested from hub: forget silent cameras"
     assert action_result(state, "export") == "requested from hub: export"
     assert "not sent" in action_result(ViewState(), "export")
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from protocols.bus.base import AgentEvent, Received
-from protocols.bus.security.sender_identity import SOURCE_TIMEOUT_S, SenderValidator
+import pytest
+
+from protocols.bus.base import AgentEvent, Received, Refusal
+from protocols.bus.security.sender_identity import SOURCE_TIMEOUT_S, SenderCheckedBus, SenderValidator
+from protocols.bus.transport.memory import MemoryBus, MemoryHub
+from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION
-from protocols.validation.codec import RejectionReason
+from protocols.validation.codec import Rejected, RejectionReason, decode
 from tests.support.samples import observation
 
 
@@ -79,3 +83,30 @@ def test_a_flood_of_invented_runs_does_not_fill_the_memory() -> None:
     for number in range(10_000):
         reason(guard, message(f"boot-{number}"), 0.0)
     assert len(guard._sources) <= 4096
+
+
+def test_who_sends_only_what_cannot_be_used_is_named_with_the_reason_while_it_lasts() -> None:
+    now = 100.0
+    bus = SenderCheckedBus(MemoryBus(MemoryHub(), "local"), lambda: now)
+    status = pb.AgentStatus(agent="hub", role="hub", state="running", message="2 cameras calibrated")
+    assert bus.with_diagnostics(status) == status
+    old = observation("cam0", 0)
+    old.schema_version = 99
+    anonymous = observation("cam1", 0, boot_id="")
+    for message in (old, anonymous):
+        with pytest.raises(Rejected) as found:
+            decode(OBSERVATION, message.SerializeToString())
+        bus.record_refusal(Refusal(found.value.reason.value, message.camera, "key", found.value.detail))
+    bus.record_refusal(Refusal("wrong_source", "cam2", "key", "a camera that was restarted"))
+    told = bus.with_diagnostics(status)
+    assert told.state == "degraded"
+    assert "messages of cam0 are not used: schema version 99, this build reads 1" in told.message
+    assert "messages of cam1 are not used: boot id '' is not usable: use 1 to 63" in told.message
+    assert "cam2" not in told.message
+    for number in range(9):
+        bus.record_refusal(Refusal("unknown_key", "", f"syncline/local/camera/cam%2C{number}/info", "no topic"))
+    told = bus.with_diagnostics(status)
+    assert "messages of syncline/local/camera/cam%2C0/info are not used: no topic;" in told.message
+    assert "messages of 8 more are not used" in told.message
+    now += 2 * SOURCE_TIMEOUT_S
+    assert bus.with_diagnostics(status).state == "running"

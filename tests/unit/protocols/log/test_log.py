@@ -329,3 +329,15 @@ def test_a_message_of_another_topic_is_a_programming_error(tmp_path: Path) -> No
         pytest.raises(TypeError, match="Observation on a topic of Calibration"),
     ):
         log.write(CALIBRATION, "hub", "local", observation(), 1)
+
+
+def test_a_log_that_cannot_be_begun_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a full disk a recorder that tried again left one empty file after the other."""
+
+    def full(self: object, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("protocols.log.write.writer._DirectFile.write", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        LogWriter(tmp_path / "log.mcap")
+    assert list(tmp_path.iterdir()) == []

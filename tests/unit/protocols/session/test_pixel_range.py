@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from protocols.core.errors import InputError
 from protocols.session.folder import read_folder
 
 
@@ -22,12 +23,16 @@ def session(folder: Path, scale: float) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("scale", [0.5, 1.0 / 640.0])
-def test_pixels_of_a_smaller_picture_are_named(scale: float, tmp_path: Path) -> None:
+def test_pixels_of_a_smaller_picture_are_named(tmp_path: Path) -> None:
     """Half of them calibrated cameras a third of a baseline off."""
-    _, observations = read_folder(session(tmp_path, scale))
+    _, observations = read_folder(session(tmp_path, 0.5))
     (warning,) = observations.warnings
     assert warning.startswith("every camera's rows lie in the upper left of its picture, within 0.")
+
+
+def test_fractions_of_a_picture_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a: all of its 200 rows lie within one pixel .* they are fractions of it"):
+        read_folder(session(tmp_path, 1.0 / 640.0))
 
 
 def test_pixels_of_the_whole_picture_are_no_warning(tmp_path: Path) -> None:
