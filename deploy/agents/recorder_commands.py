@@ -128,7 +128,7 @@ class _Waiting:
         self._sequence = 0
 
     def until(self, over: Callable[[], bool], state: str, text: str) -> None:
-        """Wait until ``over``, a start command, or the stop event."""
+        """Wait until ``over``, a start command, or the stop event; after at least one status that says why."""
         publisher = self._bus.publisher(STATUS, self._agent)
         next_status = -math.inf
         try:
@@ -136,9 +136,9 @@ class _Waiting:
                 while not self._stop.is_set() and _START not in self._commands.take():
                     now = time.monotonic()
                     if now >= next_status:
-                        next_status = now + _STATUS_S
-                        if over():
+                        if math.isfinite(next_status) and over():  # a disk may fail again as soon as it is tried
                             return
+                        next_status = now + _STATUS_S
                         self._sequence += 1
                         publisher.put(self._status(state, text))
                     self._beat()

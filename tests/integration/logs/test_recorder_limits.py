@@ -13,12 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from deploy.agents.recorder import run_recorder
+from deploy.agents import recorder_commands
+from deploy.agents.recorder import RecorderResult, run_recorder
 from deploy.agents.recorder_commands import record_on_command
 from deploy.agents.retention import Retention, Space, free_bytes, unused_log_path
 from deploy.cli import run
 from deploy.commands.agents import run as agents
 from deploy.config.agents import RecorderConfig
+from protocols.bus.base import Bus
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
@@ -95,6 +97,26 @@ def test_a_recorder_waits_for_space_and_goes_on_in_a_new_log(tmp_path: Path) -> 
     first, second = sorted((tmp_path / "logs").glob("*.mcap"))
     assert [one.message.sequence for one in LogReader(second).messages([OBSERVATION])] == [7]  # type: ignore[attr-defined]
     assert LogReader(first).damage == LogReader(second).damage == ""
+
+
+def test_a_disk_that_fails_at_every_try_is_told_between_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without limits of space a full disk was tried again without a pause, and no status said so."""
+    hub = MemoryHub()
+    told: list[list[pb.AgentStatus]] = []
+    with MemoryBus(hub) as sending, MemoryBus(hub) as bus:
+        statuses = sending.subscribe(STATUS, "recorder")
+
+        def failing(config: RecorderConfig, bus: Bus, stop: threading.Event, **more: object) -> RecorderResult:
+            told.append([one.message for one in statuses.drain() if isinstance(one.message, pb.AgentStatus)])
+            if len(told) == 3:
+                stop.set()
+            return RecorderResult(config.out, 0, {}, 0, "no space left on the disk")
+
+        monkeypatch.setattr(recorder_commands, "run_recorder", failing)
+        config = RecorderConfig(out=tmp_path, min_free_mb=0.0, min_free_percent=0.0)
+        record_on_command(config, bus, threading.Event())
+    for said in told[1:]:
+        assert [(one.state, one.message) for one in said] == [("degraded", "not recording: no space left on the disk")]
 
 
 def part(folder: Path, name: str, megabytes: float = 1.0, age_days: float = 0.0) -> Path:
