@@ -35,6 +35,9 @@ _SHAPE = 4  # parameters of a board's shape: of a quadratic surface, and the row
 _MISSHAPEN, _CONVERGED, _MAX_ROUNDS = {3: 16.27, 4: 18.47}, 1e-6, 20
 """Chi-squared by degrees of freedom above which a board is no plane of squares (0.1 % of true ones), share of the cost
 by which the last round of its adjustment lowers it, and the most rounds."""
+_MAX_CHANGE, _CHANGED = 2.0 * _MAX_FOCAL_STD, 4.2
+"""Change of the focal length between two views, of which half is an error as large as the std allowed, and the ratio to
+its std from which it is one: by chance at any of 39 places in 0.1 % of the lenses."""
 _RIDGE = 1e-12  # relative, of normal equations: of what no view determines a std follows that is refused
 
 
@@ -137,6 +140,12 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
         raise Refused(
             f"the focal length is known only to {100 * std:.2g} % (std), {100 * limit_std:.1f} % are needed: "
             "tilt the board by 20 to 45 degrees in different directions, near and far"
+        )
+    change, change_std = _focal_change(fit, at, free)
+    if not few and abs(change) > max(_MAX_CHANGE, _CHANGED * change_std):
+        raise Refused(
+            f"the focal length changes by {100 * change:+.1f} % ± {100 * change_std:.1f} % within these views: film "
+            "with the zoom and the focus fixed, autofocus and stabilisation off"
         )
     points = np.concatenate([view.points for view in accepted])
     heights = (_by_shape(points) @ fit.parameters[-_SHAPE:])[:, 2]
@@ -254,18 +263,19 @@ def _linearise(views: list[BoardView], fit: _Fit, fisheye: bool) -> _Linearised:
         at = pose[:3], pose[3:], lens.matrix, lens.distortions
         if fisheye:
             seen, jacobian = cv2.fisheye.projectPoints(points[None], *at)
-            by_lens, by_pose = jacobian[:, :8], jacobian[:, 8:14]
+            by_lens, pose_columns = jacobian[:, :8], jacobian[:, 8:14]
         else:
             seen, jacobian = cv2.projectPoints(points, *at)
-            by_lens, by_pose = jacobian[:, 6:15], jacobian[:, :6]
+            by_lens, pose_columns = jacobian[:, 6:15], jacobian[:, :6]
+        by_pose: Floats = np.asarray(pose_columns, np.float64)
         by_point = (by_pose[:, 3:] @ cv2.Rodrigues(pose[:3])[0]).reshape(-1, 2, 3)
         by_parameters = np.column_stack([by_lens, (by_point @ by_shape).reshape(len(by_lens), _SHAPE)])
         residual = np.ravel(seen) - view.pixels.ravel()
-        left = by_parameters - by_pose @ np.linalg.pinv(by_pose) @ by_parameters
+        left = _without_pose(by_parameters, by_pose)
         information += by_parameters.T @ left
         gradient += left.T @ residual
         residuals.append(residual)
-        jacobians.append((by_parameters, np.asarray(by_pose, np.float64)))
+        jacobians.append((by_parameters, by_pose))
     return _Linearised(information, gradient, residuals, jacobians)
 
 
@@ -282,6 +292,32 @@ def _focal_std(fit: _Fit, at: _Linearised, free: Floats, size: tuple[int, int], 
     inverse = _inverse(free.T @ at.information @ free)
     variance = _noise(at, free) * inverse.diagonal() + np.square(inverse @ free.T @ at.information @ centre).sum(axis=1)
     return float(np.sqrt(variance[: 1 if held else 2].max())) / float(np.sqrt(fit.parameters[0] * fit.parameters[1]))
+
+
+def _focal_change(fit: _Fit, at: _Linearised, free: Floats) -> tuple[float, float]:
+    """Relative change of the focal length from one of the views on, where it is most significant, and its std.
+
+    The score test of a lens that all views share against one whose focal length changes once.
+    """
+    by_focal = fit.parameters * (np.arange(len(fit.parameters)) < 2)
+    lefts = [_without_pose(by_parameters, by_pose) for by_parameters, by_pose in at.jacobians]
+    # Summed from the last view: of the change, with the parameters and with the residuals.
+    views = list(zip(lefts, at.jacobians, at.residuals, strict=True))[::-1]
+    shared = np.cumsum([by_parameters.T @ left @ by_focal for left, (by_parameters, _), _ in views], axis=0)
+    slopes = np.cumsum([by_focal @ left.T @ residual for left, _, residual in views])
+    crossed = shared[:-1] @ free
+    solved = crossed @ _inverse(free.T @ at.information @ free)
+    information = shared[:-1] @ by_focal - (solved * crossed).sum(axis=1)
+    information = np.maximum(information, _RIDGE * float(shared[-1] @ by_focal))
+    change = -(slopes[:-1] - solved @ free.T @ at.gradient) / information
+    std = np.sqrt(_noise(at, free) / information)
+    best = int(np.argmax(np.abs(change) / std))
+    return float(change[best]), float(std[best])
+
+
+def _without_pose(by_parameters: Floats, by_pose: Floats) -> Floats:
+    """What is left of the derivatives by the parameters where the view's pose is estimated too."""
+    return np.asarray(by_parameters - by_pose @ np.linalg.pinv(by_pose) @ by_parameters)
 
 
 def _inverse(normal: Floats) -> Floats:
