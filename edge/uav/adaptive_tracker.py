@@ -2,8 +2,8 @@
 
 Two trackers share the work. ``GroundTracker`` follows on the ground plane, where it knows roads and can say what a car
 does out of view; it needs a view in which that plane holds. ``AppearanceTracker`` follows in the stabilised image and
-needs nothing. Telemetry that says that the camera looks down decides for the ground; else the two are compared while
-both see the target, and the ground is used once it has held, and given up where it is contradicted.
+needs nothing. Telemetry that says that the camera looks down on a vehicle decides for the ground; else the two are
+compared while both see the target, and the ground is used once it has held, and given up where it is contradicted.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from protocols.geometry.types import Floats, Image
 
 _OBLIQUE_COSINE = 0.7  # of that angle, 45 degrees, beyond which the appearance joins in
 _STEEP_COSINE = 0.82  # of the angle between optical axis and vertical, 35 degrees: the ground fills the image
+_LEAST_FLAT = 2.5  # length [m] of a target that is not taller than long: less than a car, more than a person
 _AGREE, _CONTRADICT = 0.35, 0.7  # distance of the two estimates, in target lengths
 _FRAMES_TO_TRUST, _FRAMES_TO_DROP = 20, 6  # consecutive frames of agreement, contradiction
 _HIDDEN_FRAMES = 3  # frames without the target after which an untrusted ground is given up
@@ -65,7 +66,7 @@ class AdaptiveTracker:
         image = self._stretched(image)
         first = self._ground.begin(image, time, target)
         seen = self._appearance.begin(image, time, target)
-        self._steep = self._ground.view_cosine > _STEEP_COSINE
+        self._steep = self._looks_down(self._ground)
         self._cut = not self._is_complete(target)
         return self._on_ground(first) if self._steep else self._on_image(seen)
 
@@ -82,7 +83,7 @@ class AdaptiveTracker:
         if self._ground is None:
             return self._without_ground(image, time)
         ground = self._ground.handle_frame(image, time)
-        if not self._steep and self._ground.view_cosine > _STEEP_COSINE and self._trust >= 0.0:
+        if not self._steep and self._looks_down(self._ground) and self._trust >= 0.0:
             self._steep = True
         if self._steep and image is not None:
             self._leave_steep(image, ground, time)
@@ -118,14 +119,22 @@ class AdaptiveTracker:
         """The observed road near the target, see ``GroundTracker``."""
         return (np.zeros((0, 2)), None) if self._ground is None else self._ground.road_outline()
 
+    def _looks_down(self, ground: GroundTracker) -> bool:
+        """Whether the ground alone decides: seen from above, of a target that looks alike all over the image."""
+        return ground.view_cosine > _STEEP_COSINE and not _is_tall(ground)
+
     def _leave_steep(self, image: Image, ground: Estimate, time: float) -> None:
-        """Where the camera has come up to an oblique view, the appearance joins in, with the ground trusted so far."""
+        """Where the camera has come up to an oblique view, the appearance joins in, with the ground trusted so far.
+
+        Beside a target that is found to be tall, as soon as the ground is in metres, the ground is to be tried.
+        """
         assert self._ground is not None
-        oblique = self._ground.view_cosine < _OBLIQUE_COSINE
-        if oblique and ground.state is TrackState.VISIBLE and self._is_complete(_box(ground)):
+        tall = _is_tall(self._ground)
+        joins = tall or self._ground.view_cosine < _OBLIQUE_COSINE
+        if joins and ground.state is TrackState.VISIBLE and self._is_complete(_box(ground)):
             self._appearance = AppearanceTracker(self._size, self._fps)
             self._appearance.begin(image, time, _box(ground))
-            self._steep, self._trust = False, 1.0
+            self._steep, self._trust = False, 0.0 if tall else 1.0
 
     def _is_complete(self, box: Box) -> bool:
         """Whether nearly all of a box lies in the image."""
@@ -200,6 +209,11 @@ class AdaptiveTracker:
             reason = f"{100 * motion.share:.0f} % of the corners around move alike"
             return replace(estimate, basis=Basis.STABILISED, reason=reason)
         return replace(estimate, basis=Basis.IMAGE, reason="too few corners around move alike")
+
+
+def _is_tall(ground: GroundTracker) -> bool:
+    """Whether the target may be taller than long, as a person is: its outline changes with its place in the image."""
+    return ground.metric and ground.target_length < _LEAST_FLAT
 
 
 def _box(e: Estimate) -> Box:

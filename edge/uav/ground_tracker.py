@@ -159,6 +159,11 @@ class GroundTracker:
         return self._localiser.metric
 
     @property
+    def target_length(self) -> float:
+        """Of the target's longer side on the ground [ground units]."""
+        return self._target.length
+
+    @property
     def view_cosine(self) -> float:
         """Cosine of the angle between optical axis and vertical; nan where no attitude is known."""
         return self._localiser.view_cosine

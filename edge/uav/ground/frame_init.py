@@ -14,7 +14,7 @@ from protocols.geometry.types import Floats
 
 CAR_LENGTH = 4.5
 """Assumed length of the target where the scale is not observable [ground units]."""
-_MIN_CAR_LENGTH, _MAX_CAR_LENGTH = 1.2, 30.0  # of a plausible target [m]
+_MIN_LENGTH, _MAX_LENGTH = 0.3, 30.0  # of a plausible target [m]: a person from above is 0.5 m
 _MIN_HEIGHT = 2.0  # of the camera for a plausible position [m]
 _MAX_RANGE_RATIO = 12.0  # horizontal distance over height: beyond, the target is near the horizon
 
@@ -49,7 +49,7 @@ def frame_from_telemetry(
             return None
         longer_side = _longer_side(pose, normalised)
         # A height that makes the target as small as a toy or as long as a ship is wrong; the attitude may be right.
-        if _MIN_CAR_LENGTH < longer_side < _MAX_CAR_LENGTH:
+        if _MIN_LENGTH < longer_side < _MAX_LENGTH:
             return GroundFrame(pose, "metric")
     at_unit_height = PlanePose(rotation, np.array([0.0, 0.0, -1.0]))
     if not _is_within_range(at_unit_height, normalised):

@@ -13,6 +13,7 @@ from edge.uav.correlation.oriented_box import OrientedBox, crop
 from edge.uav.correlation.scale import BoxFlow
 from edge.uav.image_motion.scene_motion import STILL, SceneMotion
 from edge.uav.tracker_factory import make_tracker
+from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Image
 from tests.support.oblique.world import ObliqueWorld
@@ -214,6 +215,38 @@ def test_lens_and_telemetry_do_not_make_an_oblique_flight_worse() -> None:
             near[-1] += bool(np.hypot(e.x - centre[0], e.y - centre[1]) < max(0.3 * truth.box.width, 8.0))
     assert near[0] >= 57
     assert near[1] >= near[0]
+
+
+def test_a_person_seen_from_above_is_followed_with_telemetry() -> None:
+    """It was lost: its outline leans away from the middle of the image, which a template on the ground does not."""
+    rng, fps, height, size, focal = np.random.default_rng(2), 30.0, 12.0, (480, 360), 400.0
+    texture = cv2.GaussianBlur(rng.normal(0.0, 1.0, (900, 900)).astype(np.float32), (0, 0), 2.0)
+    ground = cv2.cvtColor(np.clip(95.0 + 7.0 * texture / texture.std(), 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    middle = 0.5 * (np.array(size) - 1.0)
+    lens = Intrinsics(*size, np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]]))
+    tracker = make_tracker("ground", size, lens, BODY_FROM_DOWN_CAMERA, fps=fps)
+    angle = np.linspace(0.0, 2.0 * np.pi, 24)
+    body = np.column_stack([0.35 * np.cos(angle), 0.25 * np.sin(angle)])  # north, east [m]
+    for i in range(-5, 100):
+        time = i / fps
+        person = np.array([1.5 * time - 3.0, 0.4 * np.sin(time)])
+        swing = 0.5 * np.pi * time + 0.5
+        camera = np.array([1.5 * time - 3.0, 0.0]) + height * np.array([0.2 * np.cos(swing), 0.3 * np.sin(swing)])
+        tracker.handle_telemetry(Telemetry(time, np.eye(3), np.append(camera, -height)))
+        if i < 0:
+            continue
+        scale, corner = 0.05 * focal / height, focal / height * np.array([-22.5 - camera[1], camera[0] - 22.5])
+        moved = np.column_stack([scale * np.eye(2), middle + corner])
+        image = cv2.warpAffine(ground, moved, size, borderMode=cv2.BORDER_REFLECT)
+        seen = [focal / (height - h) * ((person + body - camera) * [-1.0, 1.0])[:, ::-1] + middle for h in (0.0, 1.7)]
+        hull = cv2.convexHull(np.concatenate(seen).astype(np.float32))[:, 0]
+        cv2.fillConvexPoly(image, np.round(16 * hull).astype(np.int32), (60, 50, 150), cv2.LINE_AA, 4)
+        image = np.clip(image + rng.normal(0.0, 3.0, image.shape), 0, 255).astype(np.uint8)
+        (left, top), (right, bottom) = hull.min(axis=0), hull.max(axis=0)
+        box = Box(left - 1.0, top - 1.0, right - left + 3.0, bottom - top + 3.0)
+        e = tracker.begin(image, time, box) if i == 0 else tracker.handle_frame(image, time)
+        assert e.state is TrackState.VISIBLE, i
+        assert np.hypot(e.x - 0.5 * (left + right), e.y - 0.5 * (top + bottom)) < 10.0, i
 
 
 def test_a_black_image_leaves_the_plain_image_as_the_basis(scene: Image) -> None:
