@@ -212,7 +212,7 @@ class AdaptiveTracker:
 
 
 def _is_tall(ground: GroundTracker) -> bool:
-    """Whether the target may be taller than long, as a person is: its outline changes with its place in the image."""
+    """Whether the target may be taller than long, as a person is: its outline has relief displacement."""
     return ground.metric and ground.target_length < _LEAST_FLAT
 
 

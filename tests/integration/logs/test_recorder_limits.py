@@ -102,20 +102,20 @@ def test_a_recorder_waits_for_space_and_goes_on_in_a_new_log(tmp_path: Path) -> 
 def test_a_disk_that_fails_at_every_try_is_told_between_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without limits of space a full disk was tried again without a pause, and no status said so."""
     hub = MemoryHub()
-    told: list[list[pb.AgentStatus]] = []
+    statuses_before: list[list[pb.AgentStatus]] = []
     with MemoryBus(hub) as sending, MemoryBus(hub) as bus:
         statuses = sending.subscribe(STATUS, "recorder")
 
         def failing(config: RecorderConfig, bus: Bus, stop: threading.Event, **more: object) -> RecorderResult:
-            told.append([one.message for one in statuses.drain() if isinstance(one.message, pb.AgentStatus)])
-            if len(told) == 3:
+            statuses_before.append([one.message for one in statuses.drain() if isinstance(one.message, pb.AgentStatus)])
+            if len(statuses_before) == 3:
                 stop.set()
             return RecorderResult(config.out, 0, {}, 0, "no space left on the disk")
 
         monkeypatch.setattr(recorder_commands, "run_recorder", failing)
         config = RecorderConfig(out=tmp_path, min_free_mb=0.0, min_free_percent=0.0)
         record_on_command(config, bus, threading.Event())
-    for said in told[1:]:
+    for said in statuses_before[1:]:
         assert [(one.state, one.message) for one in said] == [("degraded", "not recording: no space left on the disk")]
 
 

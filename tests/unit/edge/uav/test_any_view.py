@@ -218,7 +218,7 @@ def test_lens_and_telemetry_do_not_make_an_oblique_flight_worse() -> None:
 
 
 def test_a_person_seen_from_above_is_followed_with_telemetry() -> None:
-    """It was lost: its outline leans away from the middle of the image, which a template on the ground does not."""
+    """It was lost: by relief displacement its outline changes all over the image, a template on the ground does not."""
     rng, fps, height, size, focal = np.random.default_rng(2), 30.0, 12.0, (480, 360), 400.0
     texture = cv2.GaussianBlur(rng.normal(0.0, 1.0, (900, 900)).astype(np.float32), (0, 0), 2.0)
     ground = cv2.cvtColor(np.clip(95.0 + 7.0 * texture / texture.std(), 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
