@@ -303,7 +303,9 @@ def test_a_camera_that_was_taken_away_is_forgotten_on_request(session: Session, 
             hub.tick(now + 0.01 * number)
     now += 0.01 * len(rest)
     assert hub.state(now)[0] == "degraded"
+    hub.links.notices[gone] = "left out until it is restarted"
     assert hub.forget_silent(now) == [gone]
+    assert gone not in hub.links.notices
     assert hub.state(now)[0] == "calibrated"
     (published, *_) = calibrations(hub.tick(now))
     assert gone not in [one.camera for one in (*published.cameras, *published.progress, *published.refused)]
