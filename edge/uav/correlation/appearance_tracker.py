@@ -52,7 +52,9 @@ _MOVES = 0.3  # speed over the scene at which a heading is given, in target leng
 _MAX_GROWTH = 8.0  # of a side since the first frame
 _SCALE_GAIN = 0.5  # of the scale filter's correction, per frame
 _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or angle must gain
+_TURN_GAIN = 0.08  # and that a turn must have gained: as much as the same thing changes from one image to another
 _ANCHOR_STEP = 0.3  # share of the way to it
+_UPRIGHT = 0.02  # rad: a smaller turn moves no corner of the box by a cell of a template
 _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
 _SURE_STD = 0.5  # of where it must be since the evidence was clear, in lengths, to go back to that
 _LEARN_ABOVE = 1.0  # log likelihood ratio above which appearance is learnt
@@ -323,14 +325,16 @@ class AppearanceTracker:
     def _anchored(self, image: Image, box: OrientedBox) -> OrientedBox:
         """The box, drawn towards the size, shape and angle at which it looks most like the first one.
 
-        The flow inside a box sums up what the background in it does. Seen obliquely, a target that turns does not turn
-        in the image either. The first template has none of that drift.
+        The flow inside a box sums up what the background in it does. The first template has none of that drift. Seen
+        obliquely, a target that turns does not turn in the image: a turn must show in the similarity, or it is undone.
         """
         area = float(np.sqrt(np.prod(box.sides / self._first)))
         shaped = box.sized(self._first * area)
         trials = [box.turned(-box.angle), shaped, shaped.turned(-box.angle)]
         trials += [box.sized(box.sides * factor) for factor in TRIAL_SIZES]
         now, *gains = self._memory.first_scores(image, [box, *trials])
+        if abs(box.angle) > _UPRIGHT:
+            gains[0], gains[2] = (gain + _ANCHOR_GAIN + _TURN_GAIN for gain in (gains[0], gains[2]))
         best = int(np.argmax(gains))
         if gains[best] < now + _ANCHOR_GAIN:
             return box

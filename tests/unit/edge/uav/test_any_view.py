@@ -286,3 +286,18 @@ def test_the_truth_of_an_oblique_world_is_where_the_target_is_drawn() -> None:
     shares = [world.truth(i).visible for i in range(0, 60, 6)]
     assert shares[0] > 0.9
     assert min(shares) == 0.0
+
+
+@pytest.mark.parametrize(("turned", "kept"), [(1.0, True), (0.6, False)])
+def test_a_turn_must_show_in_the_similarity(scene: Image, turned: float, kept: bool) -> None:
+    """Seen obliquely, a target that turns changes but does not turn in the image."""
+    place, angle = np.array([160.0, 120.0]), 0.3
+    image = np.ascontiguousarray(scene[200 : 200 + SIZE[1], 300 : 300 + SIZE[0]])
+    paint(image, *place)
+    tracker = AppearanceTracker(SIZE, FPS)
+    tracker.begin(image, 0.0, Box(*(place - 0.5 * np.array(TARGET)), *map(float, TARGET)))
+    rotation = cv2.getRotationMatrix2D(place.tolist(), -np.degrees(angle), 1.0)
+    later = cv2.addWeighted(cv2.warpAffine(image, rotation, SIZE), turned, image, 1.0 - turned, 0.0)
+    upright, along = tracker._memory.first_scores(later, [tracker.box, tracker.box.turned(angle)])
+    assert along > upright
+    assert (tracker._anchored(later, tracker.box.turned(angle)).angle == pytest.approx(angle)) == kept
