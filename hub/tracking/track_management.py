@@ -68,8 +68,11 @@ def initiate_tracks(
         # More than false detections would explain (3 sigma, Poisson) are people: a hall may be full at the first frame.
         arrivals = max(_ARRIVALS, len(upright) - clutter - 3.0 * np.sqrt(clutter))
         born = [candidate_on(state.floor, one, parameters.scale, arrivals / clutter) for one in upright]
-        state = _with_candidates(state, [one for one in born if one is not None], parameters)
-        own = tuple(one for one in own if not UPRIGHT[one.kind])
+        likely = [one for one in born if one is not None and one.existence >= _DELETED]
+        state = _with_candidates(state, likely, parameters)
+        # A child is too far from a person's typical height for one camera alone.
+        explained = {id(one.detections[0]) for one in likely}
+        own = tuple(one for one in own if id(one) not in explained)
         state = replace(state, unassociated={**state.unassociated, name: own})
     live = [other for other, time in state.last_frame_ns.items() if frame.reference_ns - time <= _INITIATION_WINDOW_NS]
     unassociated = {other: state.unassociated.get(other, ()) for other in live}
