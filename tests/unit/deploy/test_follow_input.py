@@ -18,6 +18,7 @@ from deploy.offline.follow.source import FollowInput, read_follow_input
 from edge.scenes.common.placement import look_at_pose
 from protocols.core.errors import InputError, Refused
 from protocols.geometry.pose import POSE_CONVENTIONS, Pose
+from tests.support import crowds
 from tests.support.crowds import NAMES, SIZE, boxes_csv, ends, poses, write_calibration
 
 SIZES = dict.fromkeys(NAMES, SIZE)
@@ -295,6 +296,18 @@ def test_people_who_meet_nowhere_are_a_warning(tmp_path: Path) -> None:
     (warning,) = read(tmp_path, "\n".join([header, *squeezed])).warnings
     assert re.match(r"of \d+ people whom one camera sees where others look, others see \d+ there", warning)
     assert read(tmp_path, boxes_csv(8.0)).warnings == ()
+
+
+def test_cameras_on_high_poles_are_no_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From 14 m a body's breadth makes boxes so much longer that no camera alone gives a place.
+
+    They were a warning, and refused as of other poses where people came nearer to each other along another vertical.
+    """
+    monkeypatch.setattr(crowds, "_STANDS", ((-7.0, -6.0, 14.0), (7.0, -6.5, 14.0), (0.5, 8.0, 14.0)))
+    header, *lines = boxes_csv(8.0).splitlines()
+    cells = [line.split(",") for line in lines]
+    longer = [",".join([*c[:6], str(1.5 * float(c[6]))]) for c in cells]
+    assert read(tmp_path, "\n".join([header, *longer])).warnings == ()
 
 
 def test_a_camera_whose_time_offset_is_years_off_is_left_out_by_name(tmp_path: Path) -> None:
