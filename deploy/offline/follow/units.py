@@ -43,6 +43,7 @@ _UPRIGHT = 0.7  # cosine of 45°: nobody upright leans as much
 _MIN_LOOKED_AT, _MIN_MET = 30, 0.1
 """People at places where another camera looks, and the share that it sees there, below which a warning is given: 0.42
 in that crowd and 0.78 in a simulated room, at most 0.06 with the pixels of pictures that were squeezed into squares."""
+_WIDE = 1.2  # width over height: boxes of people seated behind a table are about square
 _SCALE = 0.5  # log: a body's breadth shortens the distance by up to 40 %
 _LENGTH_STD, _BREADTH, _MAX_ERROR = 0.05, 0.25, 1.4
 """Of a box's length, relative; of a body over its height, which adds to the length of a box seen from above; and the
@@ -82,7 +83,10 @@ def check_units(
     the places that several cameras give coincide. Returns a warning where they hardly do in any. Raises InputError. For
     an arbitrary scale nothing is checked.
     """
-    if kind != "person" or known.calibration.scale != "metric":
+    if kind != "person":
+        return ()
+    _refuse_wide(messages, known, session)
+    if known.calibration.scale != "metric":
         return ()
     height = PERSON.size_m / METRES_PER_UNIT[known.calibration.units]
     people = _people(messages, known)
@@ -102,6 +106,19 @@ def check_units(
     ):
         return _nowhere(bodies[0], [known.calibration.cameras[name] for name in people], height)
     raise _refusal(_MISTAKES[best], bodies[best].up, known, session)
+
+
+def _refuse_wide(messages: Sequence[pb.Observation], known: GivenCalibration, session: Path) -> None:
+    """Refuse boxes that are wider than high, in cameras in whose pictures upright people stand upright."""
+    standing = {
+        name
+        for name, camera in known.calibration.cameras.items()
+        if known.up is not None and -(camera.pose.rotation.T @ known.up)[1] > _UPRIGHT
+    }
+    boxes = [d.box for message in messages if message.camera in standing for d in message.detections if d.box]
+    if len(boxes) >= _MIN_LOOKED_AT and np.median([box[2] / box[3] for box in boxes]) > _WIDE:
+        remedy = "swap width and height, or give boxes of people who stand"
+        raise InputError("most boxes are wider than high: they are of no upright people", file=session, remedy=remedy)
 
 
 def _refusal(wrong: _Mistake, up: Floats, known: GivenCalibration, session: Path) -> InputError:

@@ -142,6 +142,20 @@ def test_children_who_come_after_the_floor_is_known_are_followed() -> None:
     assert len(result.tracks) == PEOPLE
 
 
+def test_a_camera_whose_picture_is_mirrored_is_a_warning() -> None:
+    """It followed nobody, or others than the other cameras, without a word."""
+    messages, calibration, _ = crowd(3, 0.0, 0.0)
+    times = [round(frame / FPS * NANOSECONDS) for frame in range(FRAMES)]
+    assert follow(messages, calibration, times, up=UP).warnings == ()
+    for message in messages:
+        for one in message.detections if message.camera == "cam2" else ():
+            one.u = LENS.width - one.u
+            one.head[0], one.foot[0] = one.u, one.u
+    (warning,) = follow(messages, calibration, times, up=UP).warnings
+    assert warning.startswith("cam2: ")
+    assert "are its pixels, pose and time offset right?" in warning
+
+
 def test_who_vanishes_from_all_cameras_is_the_same_person_afterwards_and_has_no_rows_between() -> None:
     """Nobody is detected for 1.5 s, as where people walk off the part of the ground that is looked at."""
     messages, calibration, truth = crowd(3, 0.0, 0.0)
