@@ -316,7 +316,7 @@ def test_the_way_shows_the_height_above_the_ground(changed: list[float], height_
 
 
 def test_positions_of_another_time_differ_in_shape_and_a_gap_says_nothing() -> None:
-    """3 s late, or with north and east swapped, targets were metres off; some seconds without positions were a wrong height."""
+    """3 s late, or with north and east swapped, targets were metres off; a gap was a wrong height."""
     visual, telemetry = yawing_flight()
 
     def way(samples: list[Telemetry]) -> GroundMotion:
