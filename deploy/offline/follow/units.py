@@ -43,6 +43,9 @@ _UPRIGHT = 0.7  # cosine of 45°: nobody upright leans as much
 _MIN_LOOKED_AT, _MIN_MET = 30, 0.1
 """People at places where another camera looks, and the share that it sees there, below which a warning is given: 0.42
 in that crowd and 0.78 in a simulated room, at most 0.06 with the pixels of pictures that were squeezed into squares."""
+_SMALL, _MIN_MET_SMALL = (0.55, 0.6, 0.65, 0.7, 0.75, 0.8), 0.3
+"""Heights over an adult's, and the share that meets at one of them: 0.68 and 0.36 of seated people and children of 1 m;
+up to 0.1 of pictures that were squeezed across, but 0.5 of those squeezed along the bodies."""
 _WIDE = 1.2  # width over height: boxes of people seated behind a table are about square
 _SCALE = 0.5  # log: a body's breadth shortens the distance by up to 40 %
 _LENGTH_STD, _BREADTH, _MAX_ERROR = 0.05, 0.25, 1.4
@@ -253,6 +256,14 @@ def _nowhere(bodies: _Bodies, cameras: Sequence[CameraCalibration], height: floa
     count, met = int(looked_at.sum()), int((_met(bodies, height) & looked_at).sum())
     if count < _MIN_LOOKED_AT or met >= _MIN_MET * count:
         return ()
+    small = {share: int((_met(bodies, share * height) & looked_at).sum()) for share in _SMALL}
+    share = max(small, key=lambda one: small[one])
+    if small[share] >= _MIN_MET_SMALL * count:
+        tall = share * PERSON.size_m
+        return (
+            f"the people seem to be about {tall:.1f} m tall: of children or seated people that is right; otherwise "
+            "check the calibration's picture sizes and units",
+        )
     return (
         f"of {count} people whom one camera sees where others look, others see {met} there: are the calibration's "
         "picture sizes, poses, time offsets and units those of these detections?",

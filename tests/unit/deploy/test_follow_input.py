@@ -350,6 +350,13 @@ def test_people_who_meet_nowhere_are_a_warning(tmp_path: Path) -> None:
     assert read(tmp_path, boxes_csv(8.0)).warnings == ()
 
 
+def test_children_alone_are_named_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Picture sizes, poses, time offsets and units were in doubt though everybody was followed."""
+    monkeypatch.setattr(crowds, "HEIGHT", 1.1)
+    (warning,) = read(tmp_path, boxes_csv(8.0)).warnings
+    assert warning.startswith("the people seem to be about 1.1 m tall: of children or seated people that is right")
+
+
 def test_cameras_on_high_poles_are_no_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From 14 m a body's breadth makes boxes so much longer that no camera alone gives a place.
 
