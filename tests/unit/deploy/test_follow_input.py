@@ -354,7 +354,7 @@ def test_children_alone_are_named_as_such(tmp_path: Path, monkeypatch: pytest.Mo
     """Picture sizes, poses, time offsets and units were in doubt though everybody was followed."""
     monkeypatch.setattr(crowds, "HEIGHT", 1.1)
     (warning,) = read(tmp_path, boxes_csv(8.0)).warnings
-    assert warning.startswith("the people seem to be about 1.1 m tall: of children or seated people that is right")
+    assert warning.startswith("the people seem to be about 1.1 m tall: of children, or people seated")
 
 
 def test_cameras_on_high_poles_are_no_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
