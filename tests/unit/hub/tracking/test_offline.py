@@ -142,6 +142,18 @@ def test_children_who_come_after_the_floor_is_known_are_followed() -> None:
     assert len(result.tracks) == PEOPLE
 
 
+def test_second_boxes_of_legs_are_no_children() -> None:
+    """As of a detector that boxes one person in five twice, from the hip down too."""
+    messages, calibration, truth = crowd(3, 0.0, 0.0)
+    rng = np.random.default_rng(1)
+    for message in messages:
+        for one in list(message.detections):
+            if rng.random() < 0.2:
+                add(message, one.u, 0.45 * one.foot[1] + 0.55 * one.head[1], one.foot[1])
+    result = follow(messages, calibration, [round(frame / FPS * NANOSECONDS) for frame in range(FRAMES)], up=UP)
+    assert scores(result, truth).mota > 0.9
+
+
 def test_a_camera_whose_picture_is_mirrored_is_a_warning() -> None:
     """It followed nobody, or others than the other cameras, without a word."""
     messages, calibration, _ = crowd(3, 0.0, 0.0)
