@@ -169,7 +169,8 @@ def check_attitudes(
 
 
 def _check_motion(motion: GroundMotion | None, file: Path) -> list[str]:
-    """A warning where positions are at another height than the video shows. Raises InputError where they are wrong."""
+    """A warning where positions move along another way or at another height than the video shows. Raises InputError
+    where they are wrong."""
     if motion is None:
         return []
     if motion.contradiction:
@@ -178,6 +179,11 @@ def _check_motion(motion: GroundMotion | None, file: Path) -> list[str]:
         what = f"its positions move by {motion.reported:.2g} m in a second, but the video by {motion.seen:.0f} m"
         remedy = "give north,east,down in metres, not latitude and longitude, or leave positions out"
         raise InputError(what, file=file, remedy=remedy)
+    if motion.differs_in_shape:
+        return [
+            f"{file}: its positions move along another way than the images show: check that both are of one flight and "
+            "on one clock, and that the columns are north, east, down"
+        ]
     remedy = "give positions in metres, with heights above the ground and not above sea level"
     return [f"{file}: {motion.wrong_height}: {remedy}"] if motion.wrong_height else []
 

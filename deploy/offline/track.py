@@ -15,6 +15,7 @@ import numpy as np
 from edge.devices.base import Frame
 from edge.devices.playback.video_file import image_files
 from edge.uav.base import Basis, Box, Estimate, Telemetry, Tracker, TrackState
+from edge.uav.navigation import interpolate_positions
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry import so3
@@ -49,10 +50,12 @@ class TrackedFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TelemetryFile:
-    """Telemetry samples in strictly increasing time. left_out: discarded rows (NaN, no rotation, repeated time)."""
+    """Telemetry samples in strictly increasing time. left_out: discarded rows (NaN, no rotation, repeated time).
+    back: rows of an earlier time than the row above."""
 
     samples: tuple[Telemetry, ...]
     left_out: int
+    back: int = 0
 
 
 def parse_target(text: str) -> Box:
@@ -98,10 +101,16 @@ def read_telemetry(file: Path) -> TelemetryFile:
     if not usable.any():
         raise InputError("no usable row", file=file, line=1, remedy="record telemetry with attitude quaternions")
     left_out, table = int((~usable).sum()), table[usable]
+    back = int((np.diff(table[:, 0]) < 0.0).sum())
     table = table[np.argsort(table[:, 0], kind="stable")]
     fresh = np.r_[True, np.diff(table[:, 0]) > 0]
     left_out += int((~fresh).sum())
-    return TelemetryFile(tuple(_sample(row) for row in table[fresh]), left_out)
+    table = table[fresh]
+    # Positions often come less often than attitudes.
+    placed = np.isfinite(table[:, 5:]).all(axis=1) & (table.shape[1] == 8)
+    if placed.any() and not placed.all():
+        table[~placed, 5:] = interpolate_positions([(row[0], row[5:]) for row in table[placed]], table[~placed, 0])
+    return TelemetryFile(tuple(_sample(row) for row in table), left_out, back)
 
 
 def _sample(row: Floats) -> Telemetry:

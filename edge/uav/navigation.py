@@ -13,6 +13,22 @@ from protocols.geometry.types import Floats
 
 _EARTH_RADIUS_M = 6_378_137.0  # semi-major axis of the WGS 84 ellipsoid
 _ECCENTRICITY2 = 6.694379990141317e-3  # squared, of the WGS 84 ellipsoid
+_POSITION_GAP_S = 3.0  # greatest interval over which positions are interpolated
+
+
+def interpolate_positions(positions: list[tuple[float, Floats]], times: Floats) -> Floats:
+    """Positions (n, 3) at ``times`` (n,) [s], interpolated between those of given times; NaN where none are close."""
+    out = np.full((len(times), 3), np.nan)
+    ordered = sorted(positions, key=lambda entry: entry[0])
+    if len(ordered) < 2:
+        return out
+    known = np.array([moment for moment, _ in ordered])
+    table = np.array([position for _, position in ordered])
+    index = np.clip(np.searchsorted(known, times) - 1, 0, len(known) - 2)
+    near = (known[index + 1] - known[index] <= _POSITION_GAP_S) & (times >= known[0] - 0.5) & (times <= known[-1] + 0.5)
+    for axis in range(3):
+        out[near, axis] = np.interp(times[near], known, table[:, axis])
+    return out
 
 
 def rotation_from_euler(roll: float, pitch: float, yaw: float) -> Floats:

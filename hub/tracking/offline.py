@@ -28,6 +28,10 @@ _MIN_LOG_ODDS = 3.0
 _COASTING_S = 0.35
 """Without a detection for longer, a row is marked so; at few frames a second, for more than one and a half frames."""
 
+_MIN_DETECTIONS, _MIN_USED = 30, 0.6
+"""Detections of a camera of which the used share is judged, and that share over the other cameras' median below which
+it is warned of: 0.9 and more where all is right, 0.4 with a picture that is mirrored."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FollowedTrack:
@@ -116,7 +120,8 @@ def follow(
     smoother = _smoother(recorded, parameters)
     scans = smoother.run(progress=lambda share: said(0.5 + 0.5 * share)) if smoother is not None else []
     tracks = _sampled(smoother, scans, np.asarray(times_ns, dtype=np.int64), up) if smoother is not None else ()
-    return FollowResult(tracks, _summaries(smoother, state, cameras), tuple(warnings))
+    summaries = _summaries(smoother, state, cameras)
+    return FollowResult(tracks, summaries, (*warnings, *_unused(summaries)))
 
 
 def _smoother(recorded: list[MultiTargetState], parameters: TrackerParameters) -> BatchSmoother | None:
@@ -235,6 +240,20 @@ def _absences(scans: list[SmoothedScan], count: int) -> list[list[tuple[int, int
         last[hit], unseen[hit] = scan.now_ns, 0.0
         unseen[scan.row[missed]] += scan.odds[missed]
     return out
+
+
+def _unused(summaries: dict[str, CameraSummary]) -> list[str]:
+    """A warning for each camera whose detections are of those that the others see much less often than the others'."""
+    lines = []
+    for name, one in summaries.items():
+        others = [other.used for key, other in summaries.items() if key != name and other.detections]
+        usual = float(np.median(others)) if len(others) > 1 else 0.0
+        if one.detections >= _MIN_DETECTIONS and one.used < _MIN_USED * usual:
+            lines.append(
+                f"{name}: {100 * one.used:.0f} % of its detections are of somebody who is followed, of the others' "
+                f"{100 * usual:.0f} %: are its pixels, pose and time offset right?"
+            )
+    return lines
 
 
 def _summaries(

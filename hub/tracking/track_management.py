@@ -37,6 +37,8 @@ _SAME_TARGET_RADIUS = 0.3
 are duplicates."""
 _NEIGHBOUR, _BODY_WIDTH = 0.4, 0.18
 """As fractions of the height: two tracks nearer than the first may be one person, and nearer than the second are."""
+_PART_RADIUS, _PART_HEIGHT = 0.25, 0.8
+"""As fractions of a person's height: nearer and smaller is a box of a part of this person. Hand in hand is 0.3."""
 _TWICE = 0.02
 """Probability that one person is detected twice in a frame."""
 _MAX_OVERLAP, _MIN_OVERLAP = 3.0, -6.0
@@ -68,8 +70,11 @@ def initiate_tracks(
         # More than false detections would explain (3 sigma, Poisson) are people: a hall may be full at the first frame.
         arrivals = max(_ARRIVALS, len(upright) - clutter - 3.0 * np.sqrt(clutter))
         born = [candidate_on(state.floor, one, parameters.scale, arrivals / clutter) for one in upright]
-        state = _with_candidates(state, [one for one in born if one is not None], parameters)
-        own = tuple(one for one in own if not UPRIGHT[one.kind])
+        likely = [one for one in born if one is not None and one.existence >= _DELETED]
+        state = _with_candidates(state, likely, parameters)
+        # A child is too far from a person's typical height for one camera alone.
+        explained = {id(one.detections[0]) for one in likely}
+        own = tuple(one for one in own if id(one) not in explained)
         state = replace(state, unassociated={**state.unassociated, name: own})
     live = [other for other, time in state.last_frame_ns.items() if frame.reference_ns - time <= _INITIATION_WINDOW_NS]
     unassociated = {other: state.unassociated.get(other, ()) for other in live}
@@ -130,6 +135,13 @@ def _is_new(state: MultiTargetState, candidate: TrackCandidate, parameters: Trac
         distance = np.linalg.norm(state.targets.mean[:, POSITION] - candidate.mean[POSITION], axis=1)
         spread = np.sqrt(np.trace(candidate.covariance[POSITION, POSITION]))
         radius = 0.5 * _SAME_TARGET_RADIUS * size if up is not None else 3.0 * spread
+        if up is not None:
+            # A second box of somebody, of the legs or without them, is no child at the same place.
+            tall = np.exp(state.targets.mean[:, LOG_SIZE])
+            offset = state.targets.mean[:, POSITION] - candidate.mean[POSITION]
+            beside = np.linalg.norm(offset - (offset @ up)[:, None] * up, axis=1)
+            part = (beside < _PART_RADIUS * tall) & (size < _PART_HEIGHT * tall)
+            distance = np.where(part, 0.0, distance)
         if (distance[state.targets.kind == candidate.detections[0].kind] < radius).any():
             return False
     if up is not None and state.floor is not None and state.floor.known:

@@ -207,6 +207,9 @@ def _samples(
         raise InputError(what, file=telemetry, remedy="give both in --rig, or leave --telemetry out")
     if recorded.left_out:
         warnings.append(f"{telemetry}: {recorded.left_out} rows hold no sample and were left out")
+    if recorded.back:
+        what = f"its times go back {recorded.back} times, and were sorted"
+        warnings.append(f"{telemetry}: {what}: of a clock that was set, rows of two times are mixed")
     samples = recorded.samples
     if not own_clock:
         end = count / recording.info.fps if count else float("inf")

@@ -24,7 +24,7 @@ from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.csv_table import CsvTable, read_csv_header, read_csv_table
-from protocols.session.detections import DetectionRows, read_detections
+from protocols.session.detections import KINDS, DetectionRows, read_detections
 from protocols.validation.codec import SCHEMA_VERSION
 
 Kind = Literal["person", "vehicle"]
@@ -35,6 +35,11 @@ _MAX_TIME_S = 9e9
 _MIN_CORNERS, _MIN_OVERLAP = 20, 0.25
 """Boxes, all larger than their distance from the picture's corner, and the share of them that leaves the picture: with
 a width that is the right edge it is that of the people beyond the middle."""
+_MIN_BEYOND, _CENTRED = 10, 0.998
+"""Boxes that end right of the picture, and the share of boxes that are within it if x and y are their centres: boxes
+that their detector did not cut at the picture's border begin left of it as often."""
+_MAX_ROUNDED = 1.1
+"""Frames with one time, on average: a clock's stamps may repeat now and then."""
 _MAX_EMPTY_PER_FRAME = 20
 """Frames without a row that are added for one with rows. Rarer numbers are labels, not a numbering of the frames."""
 
@@ -52,9 +57,9 @@ class LeftOut:
 
 
 def is_boxes_file(file: Path) -> bool:
-    """Whether a CSV file has boxes by x,y in place of points u,v. Raises InputError."""
+    """Whether a CSV file has boxes by x,y in place of points u,v, or should have by its name. Raises InputError."""
     header = set(read_csv_header(file, "observations"))
-    return {"x", "y"} <= header and not {"u", "v"} <= header
+    return not {"u", "v"} <= header and ({"x", "y"} <= header or file.name == BOXES_FILE)
 
 
 def read_objects(file: Path, sizes: Mapping[str, tuple[int, int]]) -> DetectionRows:
@@ -64,7 +69,7 @@ def read_objects(file: Path, sizes: Mapping[str, tuple[int, int]]) -> DetectionR
     what, remedy), also for boxes outside the image, heads below feet, and cameras that are not in ``sizes``.
     """
     boxes = is_boxes_file(file)
-    table = read_csv_table(file, "observations", _BOX_COLUMNS if boxes else ("camera", "time"))
+    table = read_csv_table(file, "observations", _BOX_COLUMNS if boxes else ("camera", "time"), ("kind",))
     names = table.text("camera")
     table.refuse(
         np.array([name not in sizes for name in names]),
@@ -97,18 +102,7 @@ def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> Detectio
     for side, wrong in ((3, "its foot is not below its head"), (2, "its right side is not right of its left")):
         table.refuse(box[:, side] <= 0.0, partial(_flat, box, wrong))
     limit = np.array([sizes[name] for name in table.text("camera")], dtype=np.float64)
-    table.refuse(
-        np.full(len(box), bool((box <= 1.0).all())),
-        lambda row: "all boxes are within 0 to 1: fractions of the picture",
-        "multiply x and width by the picture's width, y and height by its height",
-    )
-    overlap = ((box[:, :2] + box[:, 2:]) > limit).any(axis=1)
-    corners = len(box) >= _MIN_CORNERS and (box[:, 2:] > box[:, :2]).all() and overlap.mean() > _MIN_OVERLAP
-    table.refuse(
-        np.full(len(box), bool(corners)),
-        lambda row: "width and height look like the right and the lower edge of the boxes",
-        "subtract x and y from them",
-    )
+    _refuse_other_boxes(table, box, limit)
     # Annotations of people at the border, drawn from the ground up, may just miss the picture.
     outside = ((box[:, :2] >= limit + box[:, 2:]) | (box[:, :2] + 2.0 * box[:, 2:] <= 0.0)).any(axis=1)
     table.refuse(
@@ -116,12 +110,15 @@ def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> Detectio
         partial(_outside, "the box", limit),
         "correct or remove the row, or take the calibration of this picture size",
     )
+    _refuse_rounded_times(table)
     count = len(table)
     nothing = np.full((count, 4), np.nan)
+    kind = table.text("kind") if "kind" in table.columns else [""] * count
+    table.refuse(np.array([one not in KINDS for one in kind]), lambda row: f"kind {kind[row][:40]!r} is none")
     return DetectionRows(
         camera=table.text("camera"),
         label=[""] * count,
-        kind=[""] * count,
+        kind=kind,
         frame=table.whole("frame"),
         time=table.numbers("time", _MAX_TIME_S),
         pixels=box[:, :2] + 0.5 * box[:, 2:],
@@ -133,6 +130,44 @@ def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> Detectio
         box=box,
         line=table.line,
     )
+
+
+def _refuse_other_boxes(table: CsvTable, box: Floats, limit: Floats) -> None:
+    """Refuse boxes, of all cameras or of one, that are given in another way than by top left, width and height."""
+    names = np.array(table.text("camera"))
+    groups = {"": np.ones(len(box), dtype=np.bool_)} | {f"{name}: ": names == name for name in dict.fromkeys(names)}
+    for name, mine in groups.items():
+        corner, size = box[mine, :2], box[mine, 2:]
+        beyond = corner + size > limit[mine]
+        centred = ((corner >= 0.5 * size - 1.5) & (corner + 0.5 * size <= limit[mine] + 1.5)).all(axis=1)
+        if (box[mine] <= 1.0).all():
+            what = "all boxes are within 0 to 1: fractions of the picture"
+            remedy = "multiply x and width by the picture's width, y and height by its height"
+        elif len(size) >= _MIN_CORNERS and (size > corner).all() and beyond.any(axis=1).mean() > _MIN_OVERLAP:
+            what, remedy = "width and height look like the right and the lower edge of the boxes", "subtract x and y"
+        elif beyond[:, 0].sum() >= _MIN_BEYOND and centred.mean() >= _CENTRED:
+            what, remedy = "x and y look like the middle of the boxes", "subtract half the width and half the height"
+        else:
+            continue
+        raise InputError(name + what, file=table.file, line=table.line[int(np.argmax(mine))], remedy=remedy)
+
+
+def _refuse_rounded_times(table: CsvTable) -> None:
+    """Refuse times of which several frames of one camera have the same."""
+    names, times, frames = np.array(table.text("camera")), table.numbers("time", _MAX_TIME_S), table.whole("frame")
+    for name in dict.fromkeys(names):
+        mine = np.flatnonzero(names == name)
+        pairs = np.unique(np.column_stack([times[mine], frames[mine]]), axis=0)
+        stamps = np.unique(pairs[:, 0])
+        if len(pairs) < len(mine) and len(pairs) > _MAX_ROUNDED * len(stamps):
+            same = (times == times[mine[0]]) & (names == name)
+            what = f"{len(pairs)} frames of {name} have {len(stamps)} different times: they are rounded"
+            raise InputError(
+                what,
+                file=table.file,
+                line=table.line[int(np.flatnonzero(same)[-1])],
+                remedy="give each frame's own time",
+            )
 
 
 def _check_pairs(rows: DetectionRows, file: Path) -> None:

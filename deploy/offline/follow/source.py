@@ -34,6 +34,8 @@ Progress = Callable[[str, float], None]
 LOG_OF_VIDEOS = "detections.mcap"
 _SAME_TIME_NS = NANOSECONDS
 """Cameras at 1 Hz need not have their frames at one time."""
+_MAX_INTERVAL_S = 10.0
+"""Between frames. Nobody is followed over so long; 60 frames a second in milliseconds seem 16.7 s apart."""
 _MAX_ROWS = 2_000_000
 """Reference times at which tracks are wanted: 18 h at 30 Hz."""
 
@@ -164,12 +166,18 @@ def check_log(file: Path, calibration: Path) -> tuple[str, ...]:
 
 
 def _without_clock_steps(messages: list[pb.Observation]) -> tuple[list[pb.Observation], tuple[str, ...]]:
-    """The messages on the longer side of a step of their camera's clock, as `calibrate` takes it; and warnings."""
+    """The messages on the longer side of a step of their camera's clock, as `calibrate` takes it; and warnings.
+
+    Raises InputError where frames are too far apart.
+    """
     kept: dict[str, tuple[int, int]] = {}
     warnings = []
     for camera in dict.fromkeys(message.camera for message in messages):
         times = np.sort([message.device_time_ns for message in messages if message.camera == camera])
         gaps = np.diff(times / NANOSECONDS)
+        if len(gaps) and (interval := float(np.median(gaps))) > _MAX_INTERVAL_S:
+            what = f"{camera}: its frames are {interval:.4g} s apart, over which nobody is followed"
+            raise InputError(what, remedy="give times in seconds, not in milliseconds or another unit")
         part = max(np.split(times, np.flatnonzero(gaps > MAX_PAUSE_S) + 1), key=len)
         kept[camera] = int(part[0]), int(part[-1])
         if len(part) < len(times):

@@ -43,6 +43,15 @@ _UPRIGHT = 0.7  # cosine of 45°: nobody upright leans as much
 _MIN_LOOKED_AT, _MIN_MET = 30, 0.1
 """People at places where another camera looks, and the share that it sees there, below which a warning is given: 0.42
 in that crowd and 0.78 in a simulated room, at most 0.06 with the pixels of pictures that were squeezed into squares."""
+_SMALL, _MIN_MET_SMALL = (0.55, 0.6, 0.65, 0.7, 0.75, 0.8), 0.3
+"""Heights over an adult's, and the share that meets at one of them: 0.68 and 0.36 of seated people and children of 1 m;
+up to 0.1 of pictures that were squeezed across, but 0.5 of those squeezed along the bodies."""
+_WIDE = 1.2  # width over height: boxes of people seated behind a table are about square
+_MOST_CROSSED = 4000  # people, the first ones: at 60 frames a second they are a million pairs
+_SCALE = 0.5  # log: a body's breadth shortens the distance by up to 40 %
+_LENGTH_STD, _BREADTH, _MAX_ERROR = 0.05, 0.25, 1.4
+"""Of a box's length, relative; of a body over its height, which adds to the length of a box seen from above; and the
+error of a place, in people's heights, up to which they count. With cameras at 8 m it is about 1.8."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +87,10 @@ def check_units(
     the places that several cameras give coincide. Returns a warning where they hardly do in any. Raises InputError. For
     an arbitrary scale nothing is checked.
     """
-    if kind != "person" or known.calibration.scale != "metric":
+    if kind != "person":
+        return ()
+    _refuse_wide(messages, known, session)
+    if known.calibration.scale != "metric":
         return ()
     height = PERSON.size_m / METRES_PER_UNIT[known.calibration.units]
     people = _people(messages, known)
@@ -93,9 +105,24 @@ def check_units(
     # Along a vertical far off, bodies are near 0 and many meet by chance.
     if bodies[0].up @ bodies[vertical].up < _UPRIGHT and shares[vertical] > max(_MIN_SHARE, shares[0]):
         best = vertical
-    elif shares[best] < max(_MIN_SHARE, _CLEARLY * shares[0]):
+    elif shares[best] < max(_MIN_SHARE, _CLEARLY * shares[0]) or (
+        _crossed(bodies[best], _MISTAKES[best].lengths * height) <= _crossed(bodies[0], height)
+    ):
         return _nowhere(bodies[0], [known.calibration.cameras[name] for name in people], height)
     raise _refusal(_MISTAKES[best], bodies[best].up, known, session)
+
+
+def _refuse_wide(messages: Sequence[pb.Observation], known: GivenCalibration, session: Path) -> None:
+    """Refuse boxes that are wider than high, in cameras in whose pictures upright people stand upright."""
+    standing = {
+        name
+        for name, camera in known.calibration.cameras.items()
+        if known.up is not None and -(camera.pose.rotation.T @ known.up)[1] > _UPRIGHT
+    }
+    boxes = [d.box for message in messages if message.camera in standing for d in message.detections if d.box]
+    if len(boxes) >= _MIN_LOOKED_AT and np.median([box[2] / box[3] for box in boxes]) > _WIDE:
+        remedy = "swap width and height, or give boxes of people who stand"
+        raise InputError("most boxes are wider than high: they are of no upright people", file=session, remedy=remedy)
 
 
 def _refusal(wrong: _Mistake, up: Floats, known: GivenCalibration, session: Path) -> InputError:
@@ -197,19 +224,49 @@ def _met(bodies: _Bodies, height: float) -> Bools:
     return met
 
 
+def _crossed(bodies: _Bodies, height: float) -> float:
+    """The share of people at whose feet the ray of another camera's person passes, at the distance that both people's
+    heights give within a factor: where cameras are high or far, no camera alone gives a place."""
+    first = np.sort(bodies.time)[:_MOST_CROSSED]
+    pairs = cKDTree(first[:, None]).query_pairs(0.5 * _SAME_TIME_NS, output_type="ndarray")
+    pairs = np.argsort(bodies.time, kind="stable")[pairs]
+    one, other = pairs[bodies.owner[pairs[:, 0]] != bodies.owner[pairs[:, 1]]].T
+    u, v, between = bodies.foot[one], bodies.foot[other], bodies.centre[one] - bodies.centre[other]
+    uu, uv, vv, ub, vb = (np.einsum("ni,ni->n", *two) for two in ((u, u), (u, v), (v, v), (u, between), (v, between)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scales = np.stack([uv * vb - vv * ub, uu * vb - uv * ub]) / (uu * vv - uv**2)
+        missed = np.linalg.norm(between + scales[0, :, None] * u - scales[1, :, None] * v, axis=1)
+    near = (missed < _WITHIN * height) & (np.abs(np.log(np.maximum(scales, 1e-9) / height)) < _SCALE).all(axis=0)
+    return len(np.union1d(one[near], other[near])) / max(len(first), 1)
+
+
 def _nowhere(bodies: _Bodies, cameras: Sequence[CameraCalibration], height: float) -> tuple[str, ...]:
     """A warning where other cameras see hardly any of the people at whose place they look."""
     looked_at = np.zeros(len(bodies.time), dtype=np.bool_)
     place = bodies.centre + height * bodies.foot
+    below = -(bodies.foot @ bodies.up)
+    distance = np.linalg.norm(bodies.foot, axis=1)
+    steepness = below / np.sqrt(np.maximum(distance**2 - below**2, 1e-9))
+    known = distance * (_LENGTH_STD + _BREADTH * np.abs(steepness)) < _MAX_ERROR
     for index, camera in enumerate(cameras):
-        own = bodies.time[bodies.owner == index]
+        mine = bodies.owner == index
+        own = bodies.time[mine]
         near = np.abs(bodies.time[:, None] - own).min(axis=1, initial=np.inf) <= _SAME_TIME_NS
         pixel = camera.intrinsics.project(camera.pose.camera_from_world(place))
         inside = ((pixel > 0.0) & (pixel < [camera.intrinsics.width, camera.intrinsics.height])).all(axis=1)
-        looked_at |= inside & near & (bodies.owner != index)
+        looked_at |= inside & near & ~mine
+    looked_at &= known
     count, met = int(looked_at.sum()), int((_met(bodies, height) & looked_at).sum())
     if count < _MIN_LOOKED_AT or met >= _MIN_MET * count:
         return ()
+    small = {share: int((_met(bodies, share * height) & looked_at).sum()) for share in _SMALL}
+    share = max(small, key=lambda one: small[one])
+    if small[share] >= _MIN_MET_SMALL * count:
+        tall = share * PERSON.size_m
+        return (
+            f"the people seem to be about {tall:.1f} m tall: of children, or people seated or partly hidden, that is "
+            "right; otherwise check the calibration's picture sizes and units",
+        )
     return (
         f"of {count} people whom one camera sees where others look, others see {met} there: are the calibration's "
         "picture sizes, poses, time offsets and units those of these detections?",

@@ -19,12 +19,12 @@ from edge.mavlink.link.framing import V1, V2, frame_length
 from edge.mavlink.roles.local_frame import LocalFrame
 from edge.mavlink.roles.telemetry import Attitude, GlobalPosition, LocalPosition, parse_telemetry
 from edge.uav.base import Telemetry
+from edge.uav.navigation import interpolate_positions
 from protocols.core.errors import InputError
 from protocols.core.files import read_bytes
 from protocols.geometry.types import Floats
 
 _STAMP = 8  # bytes: Unix time in µs before each frame
-_POSITION_GAP_S = 3.0  # greatest interval over which positions are interpolated
 _REBOOT_S = 1.0  # by which a boot time goes back: less is reordering
 
 
@@ -124,24 +124,9 @@ def _samples(messages: list[Any], system: int, unreadable: int, file: Path) -> T
     attitudes, positions = max(boots, key=lambda boot: len(boot[0]))
     if len(attitudes) < 2:
         raise InputError("no usable attitude in this log", file=file, remedy="record ATTITUDE at 20 Hz or more")
-    positions_at = _interpolate_positions(positions, np.array([attitude.boot_s for attitude in attitudes]))
+    positions_at = interpolate_positions(positions, np.array([attitude.boot_s for attitude in attitudes]))
     samples = tuple(
         Telemetry(attitude.boot_s, attitude.ned_from_body, None if np.isnan(position).any() else position)
         for attitude, position in zip(attitudes, positions_at, strict=True)
     )
     return Tlog(samples, system, left_out, unreadable, len(boots))
-
-
-def _interpolate_positions(positions: list[tuple[float, Floats]], times: Floats) -> Floats:
-    """Positions (n, 3) interpolated at ``times`` (n,); NaN where none are close in time."""
-    out = np.full((len(times), 3), np.nan)
-    ordered = sorted(positions, key=lambda entry: entry[0])
-    if len(ordered) < 2:
-        return out
-    known = np.array([moment for moment, _ in ordered])
-    table = np.array([position for _, position in ordered])
-    index = np.clip(np.searchsorted(known, times) - 1, 0, len(known) - 2)
-    near = (known[index + 1] - known[index] <= _POSITION_GAP_S) & (times >= known[0] - 0.5) & (times <= known[-1] + 0.5)
-    for axis in range(3):
-        out[near, axis] = np.interp(times[near], known, table[:, axis])
-    return out

@@ -28,6 +28,10 @@ def check_target_box(image: Image, size: tuple[int, int], target: Box) -> None:
         raise InputError(
             f"target {text} is outside the image of {width}x{height}", remedy="give x,y,w,h of a car in the image"
         )
+    inside = target.x < target.width <= width and target.y < target.height <= height
+    if inside and (target.x + target.width > width or target.y + target.height > height):
+        what = f"target {text} reaches beyond the image, and looks like its left, top, right and lower edge"
+        raise InputError(what, remedy="give x,y,w,h with width and height")
     if target.width * target.height > 0.5 * width * height:
         raise InputError(f"target {text} fills the image", remedy="draw the box round one target")
 

@@ -19,9 +19,11 @@ from protocols.geometry.types import Bools, Floats
 CONTRADICTION = "positions move otherwise than the images"
 """Begins the reason where telemetry is of another mounting, camera or heading."""
 _WINDOW_S = 1.0  # over which ways are compared: an unknown offset of the clocks of 0.5 s matters little
+_MAX_GAP_S = 1.5  # between positions that are interpolated: of receivers at 1 Hz
 _MIN_WINDOWS = 5  # by chance a coherence of 0.9 is one of 700 among so few
 _MIN_WAY = 0.015  # heights a window (rms), 0.9 m/s at 60 m: ten times the images' error in a simulated hover
 _MIN_COHERENCE = 0.9  # of a simulated flight it is 0.995, in wind, with clocks 0.25 s apart
+_UNLIKE = 0.75  # with clocks 0.5 s apart it is at least 0.79, in six simulated flights; 3 s apart, 0.2 to 0.6 in four
 _MAX_TURN = 0.25 * math.pi  # nearer to another quarter turn than to none; no compass is so wrong
 _MAX_LOG_RATIO = 0.12  # of both ways: of simulated flights with clocks 0.25 s apart it is up to 0.1
 _STANDS_STILL = 0.01  # ratio of positions in degrees, or that never change; no ground is so much nearer
@@ -65,6 +67,11 @@ class GroundMotion:
         return self.coherence >= _MIN_COHERENCE and self.reported >= _MIN_WAY * self.height
 
     @property
+    def differs_in_shape(self) -> bool:
+        """Whether both are long, and ways of different flights or times."""
+        return self.coherence < _UNLIKE and self.reported >= _MIN_WAY * self.height
+
+    @property
     def contradiction(self) -> str:
         """That the positions are of a camera mounted otherwise; "" where they are not."""
         if not self.agrees_in_shape or abs(self.turn) <= _MAX_TURN:
@@ -101,6 +108,8 @@ def compare_ways(
     positions = np.array([sample.position for sample in placed])
     starts, ends = images.starts + offset, images.ends + offset
     inside = (starts >= times[0]) & (ends <= times[-1])
+    after = np.clip(np.searchsorted(times, starts, side="right"), 1, len(times) - 1)
+    inside &= times[after] - times[after - 1] <= _MAX_GAP_S
     starts, ends, moved = starts[inside], ends[inside], images.moved[inside]
     nearest = np.clip(np.searchsorted(times, starts), 0, len(times) - 1)
     heights = np.maximum(-positions[nearest, 2], 0.0)

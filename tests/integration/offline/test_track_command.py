@@ -112,6 +112,21 @@ def test_telemetry_adds_ground_columns_and_start_selects_the_frame(
     assert float(rows[20]["course"]) == pytest.approx(np.pi / 2, abs=0.1)
 
 
+def test_positions_may_come_less_often_than_attitudes_and_times_that_go_back_are_named(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With every fifth row's position none was used, and it was said that they are in no metres."""
+    lines = (recording / "telemetry.csv").read_text().splitlines()
+    sparse = [",".join([*line.split(",")[:5], "", "", ""]) if i % 5 else line for i, line in enumerate(lines[1:])]
+    (tmp_path / "telemetry.csv").write_text("\n".join([lines[0], *sparse[30:], *sparse[:30]]) + "\n")
+    extra = ["--rig", str(recording / "rig.toml"), "--telemetry", str(tmp_path / "telemetry.csv")]
+    assert run(["track", str(recording / "pictures"), "--target", TARGET, "--out", str(tmp_path / "out"), *extra]) == 0
+    output = capsys.readouterr().out
+    assert "positions were used in no frame" not in output
+    assert "its times go back 1 times" in output
+    assert float(table(tmp_path / "out" / "track.csv")[20]["speed"]) == pytest.approx(12.0, abs=1.0)
+
+
 def test_a_video_file_gives_its_own_times_and_a_larger_overlay(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert run(["track", str(recording / "film.mp4"), "--target", TARGET, "--out", str(out), "--overlay"]) == 0
@@ -150,6 +165,7 @@ def test_the_same_seed_writes_the_same_bytes(recording: Path, tmp_path: Path) ->
     [
         (["--target", "500,20,30,20"], "outside the image"),
         (["--target", "50,20,2,2"], "too small"),
+        (["--target", "180,118,216,134"], "looks like its left, top, right and lower edge"),
         (["--target", "50,20,30"], "four"),
         (["--target", "a,b,c,d"], "four numbers"),
         (["--target", "50,20,-30,20"], "width or height"),

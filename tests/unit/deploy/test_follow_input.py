@@ -18,6 +18,7 @@ from deploy.offline.follow.source import FollowInput, read_follow_input
 from edge.scenes.common.placement import look_at_pose
 from protocols.core.errors import InputError, Refused
 from protocols.geometry.pose import POSE_CONVENTIONS, Pose
+from tests.support import crowds
 from tests.support.crowds import NAMES, SIZE, boxes_csv, ends, poses, write_calibration
 
 SIZES = dict.fromkeys(NAMES, SIZE)
@@ -287,6 +288,58 @@ def test_boxes_of_other_pictures_or_of_half_bodies_are_named(
         read_follow_input(tmp_path, known if up else replace(known, up=None), "person", tmp_path)
 
 
+def test_swapped_widths_and_heights_are_named(tmp_path: Path) -> None:
+    header, *lines = boxes_csv(3.0).splitlines()
+    swapped = [",".join([*(c := line.split(","))[:5], c[6], c[5]]) for line in lines]
+    assert "most boxes are wider than high" in str(bad(tmp_path, "\n".join([header, *swapped])))
+
+
+def test_one_cameras_fractions_are_named(tmp_path: Path) -> None:
+    """Its rows were nobody's, without a word."""
+    header, *lines = boxes_csv(3.0).splitlines()
+    cells = [line.split(",") for line in lines]
+    text = [",".join([*c[:3], *(str(float(v) / 1000) for v in c[3:])] if c[0] == "back" else c) for c in cells]
+    error = bad(tmp_path, "\n".join([header, *text]))
+    assert "back: all boxes are within 0 to 1" in str(error)
+    assert error.line is not None
+    assert text[error.line - 2].startswith("back,0,")
+
+
+def test_middles_of_boxes_are_named_where_people_walk_out_on_the_right(tmp_path: Path) -> None:
+    """Of a detector that cuts boxes at the picture's border; x and y of its top left are nowhere beyond it."""
+    boxes = [(x, 300.0, 40.0, 160.0) for x in (*np.linspace(0.0, 900.0, 48), *np.linspace(902.0, 920.0, 12))]
+    corners = [f"left,{i},{i},{x},{y},{w},{h}" for i, (x, y, w, h) in enumerate(boxes)]
+    middles = [f"left,{i},{i},{x + w / 2},{y + h / 2},{w},{h}" for i, (x, y, w, h) in enumerate(boxes)]
+    assert len(read_objects(rows(tmp_path, "\n".join([BOXES.strip(), *corners])), SIZES)) == 60
+    assert "x and y look like the middle" in str(bad(tmp_path, "\n".join([BOXES.strip(), *middles])))
+
+
+def test_times_that_several_frames_share_are_named(tmp_path: Path) -> None:
+    """They became one frame with everybody several times: 22 tracks of 4 people."""
+    header, *lines = boxes_csv(3.0).splitlines()
+    cells = [line.split(",") for line in lines]
+    whole = [",".join([*c[:2], str(int(float(c[2]))), *c[3:]]) for c in cells]
+    assert "15 frames of left have 3 different times" in str(bad(tmp_path, "\n".join([header, *whole])))
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e6])
+def test_times_in_another_unit_are_named(unit: float, tmp_path: Path) -> None:
+    """128 tracks of 5 people in 5800 s, or none."""
+    header, *lines = boxes_csv(3.0).splitlines()
+    cells = [line.split(",") for line in lines]
+    other = [",".join([*c[:2], str(unit * float(c[2])), *c[3:]]) for c in cells]
+    assert "give times in seconds" in str(bad(tmp_path, "\n".join([header, *other])))
+
+
+def test_boxes_of_another_kind_are_left_out_and_other_columns_of_a_boxes_file_are_asked_for(tmp_path: Path) -> None:
+    header, *lines = boxes_csv(3.0).splitlines()
+    kinds = [f"{line},{'vehicle' if index % 3 else 'person'}" for index, line in enumerate(lines)]
+    source = read(tmp_path, "\n".join([f"{header},kind", *kinds]))
+    assert sum(len(one.detections) for one in source.observations) == len(lines) / 3
+    error = bad(tmp_path, "camera,frame,time,left,top,w,h\nleft,0,0,1,2,3,4\n")
+    assert error.remedy == "the first line must name camera,frame,time,x,y,width,height"
+
+
 def test_people_who_meet_nowhere_are_a_warning(tmp_path: Path) -> None:
     """As from pictures that a detector squeezed into squares."""
     header, *lines = boxes_csv(8.0).splitlines()
@@ -295,6 +348,25 @@ def test_people_who_meet_nowhere_are_a_warning(tmp_path: Path) -> None:
     (warning,) = read(tmp_path, "\n".join([header, *squeezed])).warnings
     assert re.match(r"of \d+ people whom one camera sees where others look, others see \d+ there", warning)
     assert read(tmp_path, boxes_csv(8.0)).warnings == ()
+
+
+def test_children_alone_are_named_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Picture sizes, poses, time offsets and units were in doubt though everybody was followed."""
+    monkeypatch.setattr(crowds, "HEIGHT", 1.1)
+    (warning,) = read(tmp_path, boxes_csv(8.0)).warnings
+    assert warning.startswith("the people seem to be about 1.1 m tall: of children, or people seated")
+
+
+def test_cameras_on_high_poles_are_no_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From 14 m a body's breadth makes boxes so much longer that no camera alone gives a place.
+
+    They were a warning, and refused as of other poses where people came nearer to each other along another vertical.
+    """
+    monkeypatch.setattr(crowds, "_STANDS", ((-7.0, -6.0, 14.0), (7.0, -6.5, 14.0), (0.5, 8.0, 14.0)))
+    header, *lines = boxes_csv(8.0).splitlines()
+    cells = [line.split(",") for line in lines]
+    longer = [",".join([*c[:6], str(1.5 * float(c[6]))]) for c in cells]
+    assert read(tmp_path, "\n".join([header, *longer])).warnings == ()
 
 
 def test_a_camera_whose_time_offset_is_years_off_is_left_out_by_name(tmp_path: Path) -> None:

@@ -315,6 +315,24 @@ def test_the_way_shows_the_height_above_the_ground(changed: list[float], height_
     assert motion.wrong_height == ("" if height_m is None else shown)
 
 
+def test_positions_of_another_time_differ_in_shape_and_a_gap_says_nothing() -> None:
+    """3 s late, or with north and east swapped, targets were metres off; a gap was a wrong height."""
+    visual, telemetry = yawing_flight()
+
+    def way(samples: list[Telemetry]) -> GroundMotion:
+        motion = compare_ways(visual, samples, BODY_FROM_DOWN_CAMERA, 0.1)
+        assert motion is not None
+        return motion
+
+    swapped = [replace(one, position=one.position[[1, 0, 2]]) for one in telemetry if one.position is not None]
+    assert way(swapped).differs_in_shape
+    gap = way([one for one in telemetry if not 4.0 < one.time < 12.0])
+    for motion in (way(telemetry), gap):
+        assert not motion.differs_in_shape
+        assert motion.wrong_height == ""
+        assert motion.coherence > 0.99
+
+
 def test_a_contradicted_mounting_is_trusted_again_only_by_a_way_that_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
     """In a hover the images show nothing, and positions of the wrong mounting were given again."""
     visual, telemetry = yawing_flight()
