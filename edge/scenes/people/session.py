@@ -5,58 +5,33 @@ The identities are given by the labels, as for the marker: data association is t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from edge.scenes.common.base import SimulatedTrack
 from edge.scenes.people.scene import PeopleScene
-from protocols.geometry.types import Bools, Floats, Ints
+from protocols.geometry.types import Bools, Floats
 
 HIDDEN_PX = 3.0
 """A head top or foot point at least this far inside a nearer body's box is occluded."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PeopleTrack:
-    """Detections of one camera, rows in order of time.
-
-    frame: (n,). time: (n,) [s] on the camera's own clock. pixels: (n, 2). size: (n,) [px] from head to foot. label: n
-    names, person0-head, person0-foot, …; ground truth: true_time (n,) [s].
-    """
-
-    camera: str
-    frame: Ints
-    time: Floats
-    pixels: Floats
-    size: Floats
-    label: tuple[str, ...]
-    true_time: Floats
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-
 def simulate_people_tracks(
     scene: PeopleScene, duration_s: float, seed: int, *, pixel_noise: float, drop_fraction: float | None = None
-) -> dict[str, PeopleTrack]:
-    """Simulate detections for ``duration_s`` from true time 0, one track per camera; reproducible.
+) -> dict[str, SimulatedTrack]:
+    """Simulate detections by camera, labelled person0-head, person0-foot, …; size: [px] from head to foot.
 
-    pixel_noise: std of each coordinate [px]. drop_fraction: share of dropped frames, in place of the cameras' own.
+    pixel_noise: std of each coordinate [px]. For the others see ``SimulatedScene.exposures``.
     """
     tracks = {}
     names = [(f"{one.name}-head", f"{one.name}-foot") for one in scene.people]
-    for index, camera in enumerate(scene.cameras):
-        rng = np.random.default_rng([seed, index])
-        count = max(int((duration_s - camera.start_s) * camera.fps * camera.clock.rate), 0)
-        true_time = camera.capture_times(camera.start_s, 0, count, rng)
-        kept = rng.random(count) >= (camera.drop_fraction if drop_fraction is None else drop_fraction)
+    for camera, rng, true_time, kept in scene.exposures(duration_s, seed, drop_fraction):
         seconds = camera.clock.stamps(true_time, rng)
         pixels, visible = visible_points(scene, camera.name, true_time)
         visible &= kept[:, None, None]
         size = np.linalg.norm(pixels[:, :, 0] - pixels[:, :, 1], axis=-1)
         noisy = pixels + rng.normal(0.0, pixel_noise, pixels.shape)
         frame, person, end = np.nonzero(visible)
-        tracks[camera.name] = PeopleTrack(
+        tracks[camera.name] = SimulatedTrack(
             camera=camera.name,
             frame=frame.astype(np.int64),
             time=seconds[frame],
@@ -64,6 +39,7 @@ def simulate_people_tracks(
             size=size[frame, person],
             label=tuple(names[who][which_end] for who, which_end in zip(person, end, strict=True)),
             true_time=true_time[frame],
+            is_outlier=np.zeros(len(frame), dtype=np.bool_),
         )
     return tracks
 
