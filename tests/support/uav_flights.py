@@ -21,8 +21,7 @@ from deploy.config.uav import SimulatedFlightConfig, UavConfig
 from edge.agents.uav import UavAgent
 from edge.agents.uav_settings import UavSettings
 from edge.devices.base import Frame
-from edge.devices.simulated.aircraft import Disturbance, SimulatedAircraft
-from edge.devices.simulated.aircraft_camera import FlightCamera
+from edge.devices.simulated.aircraft import Disturbance, FlightCamera, SimulatedAircraft
 from edge.mavlink.dialect import CAMERA
 from edge.mavlink.link.connection import Link
 from edge.mavlink.link.signing import Signing
