@@ -201,8 +201,12 @@ def assemble_calibration(
         + (refuted_lens_warnings(names, problem, state, refine_lenses) if tests_lenses else ())
         + _other_frame_rates(rig, cameras, names[reference])
         + _rejected_rows(names, problem, state)
-        + _estimated_readouts(cameras)
-        + _estimated_jitter(names, state, time_scales)
+        + readout_notes(cameras, "the trajectory")
+        + (
+            ()
+            if state.jitter is None
+            else jitter_notes(names, state.jitter / np.array(time_scales), "its observations")
+        )
         + _wandering_clocks(names, state, time_scales)
         + _clock_step_warnings(cameras)
         + _wrong_detector_stds(cameras)
@@ -344,22 +348,21 @@ def _readout(rig: Rig, name: str, found: float) -> float:
     return float(np.clip(found, -longest, longest)) if given is None else given
 
 
-def _estimated_readouts(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
-    """One sentence for each estimated rolling-shutter readout."""
+def readout_notes(cameras: dict[str, CameraCalibration], by: str) -> tuple[str, ...]:
+    """One sentence for each rolling-shutter readout that was estimated ``by`` something."""
     return tuple(
-        f"{name}: its rolling-shutter readout was estimated from the trajectory: "
+        f"{name}: its rolling-shutter readout was estimated from {by}: "
         f"{1e3 * camera.readout:.1f} ms from the first row to the last ± {1e3 * camera.readout_std:.1f} ms (std)"
         for name, camera in cameras.items()
         if camera.readout_std > 0.0
     )
 
 
-def _estimated_jitter(names: list[str], state: AdjustmentState, time_scales: list[float]) -> tuple[str, ...]:
-    """One sentence for each camera with time-stamp jitter."""
-    stds = np.zeros(len(names)) if state.jitter is None else state.jitter / np.array(time_scales)
+def jitter_notes(names: list[str], stds: Floats, by: str) -> tuple[str, ...]:
+    """One sentence for each camera with time-stamp jitter, of stds (cameras,) [s], estimated ``by`` something."""
     return tuple(
-        f"{name}: its stamps jitter by {1e3 * std:.2g} ms (std): each frame's time was estimated from its observations"
-        for name, std in zip(names, stds, strict=True)
+        f"{name}: its stamps jitter by {1e3 * std:.2g} ms (std): each frame's time was estimated from {by}"
+        for name, std in zip(names, stds.tolist(), strict=True)
         if std > 0.0
     )
 
