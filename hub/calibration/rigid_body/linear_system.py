@@ -34,7 +34,7 @@ CAUCHY = 3.0
 class CameraRows:
     """Linearised rows of one camera at a state.
 
-    evaluation: residuals of its n rows. index: (V,) first path parameter of each view. weights, slopes: (n, 4) of the
+    evaluation: residuals of its n rows. index: (V,) first path parameter of each view. weights: (n, 4) of the
     four control points. pose_jacobian: (n, 3, 7) of the point by the interpolated pose. weight: (n,) information.
     turns: (n, 3, 3) world from body, where the shape is estimated.
     """
@@ -42,7 +42,6 @@ class CameraRows:
     evaluation: ResidualEvaluation
     index: Ints
     weights: Floats
-    slopes: Floats
     pose_jacobian: Floats
     weight: Floats
     turns: Floats | None
@@ -103,7 +102,7 @@ def linearised_rows(problem: BodyProblem, state: BodyState, camera: int, robust:
     weight = information / (1.0 + squared / CAUCHY**2) if robust else np.full(len(pose), information)
     weight = np.where(found.valid & problem.use[camera], weight, 0.0)
     turns = rotations(pose[:, 3:]) if problem.free_shape else None
-    return CameraRows(found, POSE * index, row_weights, slopes[views.view], pose_jacobian, weight, turns)
+    return CameraRows(found, POSE * index, row_weights, pose_jacobian, weight, turns)
 
 
 def view_index(problem: BodyProblem, state: BodyState, camera: int) -> Ints:

@@ -200,7 +200,7 @@ def test_candidates_at_other_frame_rates_do_not_displace_those_at_the_nominal_on
     prepared, pairs = solve_pairs(prepare(good.rig, good.observations()), lambda text, share: None)
     path = solve_network(prepared, pairs, lambda text, share: None).reconstruction
     scan = resection_scan.moment_scan
-    crowd = [resection_scan.TimeMapCandidate(2.0, float(lag), 0.0, 10.0) for lag in range(20)]
+    crowd = [resection_scan.TimeMapCandidate(2.0, float(lag), 0.0) for lag in range(20)]
     monkeypatch.setattr(resection_scan, "moment_scan", lambda *of: scan(*of) if of[2] == 1.0 else crowd)
     camera = prepare(session.rig, session.observations()).cameras["cam3"]
     assert find_time_map(camera, path, (1.0, 2.0))[0] == find_time_map(camera, path, (1.0,))[0]

@@ -11,12 +11,12 @@ import pytest
 
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
-from edge.mavlink.link.transport import Pipe
 from edge.mavlink.roles import camera as camera_role
 from edge.mavlink.roles.camera import ArmFollow, CameraComponent, OperatorCommand, SelectTarget, StopTracking
 from edge.mavlink.roles.camera_messages import VideoStream
 from edge.mavlink.roles.message_rates import MessageRates
 from protocols.geometry.camera import Intrinsics
+from tests.support.pipe import Pipe
 
 ACTIVE, ERROR, COASTING = 1, 2, 8
 LENS = Intrinsics(640, 480, np.array([[320.0, 0.0, 319.5], [0.0, 240.0, 239.5], [0.0, 0.0, 1.0]]))
