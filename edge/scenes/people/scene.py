@@ -77,10 +77,6 @@ class PeopleScene(SimulatedScene):
         """Midpoints (t, n, 3) [m] of head and foot."""
         return 0.5 * (self.heads(true_time) + self.feet(true_time))
 
-    def headings(self, true_time: Floats) -> Floats:
-        """Headings (t, n) [rad] from the x axis."""
-        return self.paths.at(true_time)[2]
-
     def seen_by(self, camera: str, points: Floats) -> Floats:
         """Distorted pixels (..., 2) of points (..., 3) [m]; NaN where they are behind the camera."""
         simulated = self.camera(camera)
