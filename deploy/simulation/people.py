@@ -12,8 +12,7 @@ from deploy.simulation.session import TRUTH_HZ, TRUTH_TRAJECTORY, true_times, wr
 from edge import scenes
 from edge.scenes import renderer_for
 from edge.scenes.common.base import SimulatedTrack
-from edge.scenes.people.scene import PeopleScene
-from edge.scenes.people.session import simulate_people_tracks, visible_points
+from edge.scenes.people.scene import PeopleScene, simulate_people_tracks, visible_points
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
 

@@ -11,7 +11,7 @@ import tomli_w
 
 from edge import scenes
 from edge.scenes.common.base import SimulatedScene, SimulatedTrack
-from edge.scenes.marker.session import simulate_tracks
+from edge.scenes.marker.scene import simulate_tracks
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically

@@ -28,7 +28,7 @@ from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import RigCamera
 from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE, PREDICTION, STATUS, Topic
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 _MAX_AGE_S = 0.5  # a prediction farther away in time is not used for a frame
 _VELOCITY_STD = 60.0  # px/s, std of a target's deviation from the predicted image velocity

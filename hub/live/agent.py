@@ -40,7 +40,7 @@ from protocols.topics import (
     TRACK_SMOOTHED,
     Topic,
 )
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "hub"
 _TICK_S = 0.05  # s: of the hub's loop, below a frame at 15 Hz

@@ -14,8 +14,8 @@ from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
 from protocols.session.rig import Rig
-from protocols.validation.codec import MAX_PAYLOAD, SCHEMA_VERSION
-from protocols.validation.rules import MAX_TEXT
+from protocols.validation.codec import MAX_PAYLOAD
+from protocols.validation.rules import MAX_TEXT, SCHEMA_VERSION
 
 
 def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[str, str]) -> pb.Calibration:

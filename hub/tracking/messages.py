@@ -16,7 +16,7 @@ from hub.tracking.parameters import TrackerParameters, track_label
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 _COASTING_AFTER_S = 0.35  # three frames missed at 10 fps
 MARKER_COASTING_AFTER_S = 0.2  # six frames missed at 30 fps

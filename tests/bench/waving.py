@@ -13,7 +13,7 @@ import numpy as np
 
 from deploy.simulation.session import simulated_observations
 from edge import scenes
-from edge.scenes.marker.session import simulate_tracks
+from edge.scenes.marker.scene import simulate_tracks
 from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import Refused

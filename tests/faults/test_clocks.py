@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge import scenes
-from edge.scenes.marker.session import simulate_tracks
+from edge.scenes.marker.scene import simulate_tracks
 from hub.live.live_hub import LiveHub, LiveSettings
 from protocols.messages import syncline_pb2 as pb
 from tests.faults.matrix import measured

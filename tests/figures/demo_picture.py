@@ -13,8 +13,7 @@ from deploy.simulation.session import simulated_observations
 from edge import scenes
 from edge.scenes import renderer_for
 from edge.scenes.common.base import SimulatedTrack
-from edge.scenes.marker.scene import MarkerScene
-from edge.scenes.marker.session import simulate_tracks
+from edge.scenes.marker.scene import MarkerScene, simulate_tracks
 from hub.calibration.pipeline import calibrate
 from protocols.geometry.pose import Pose, fit_similarity
 from protocols.geometry.types import Floats

@@ -21,7 +21,7 @@ from protocols.session.csv_table import read_csv_header
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, read_rig
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message

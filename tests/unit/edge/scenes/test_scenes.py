@@ -13,7 +13,7 @@ from edge import scenes
 from edge.scenes import renderer_for
 from edge.scenes.common.base import SimulatedClock
 from edge.scenes.marker import renderer as rendering
-from edge.scenes.marker.session import simulate_tracks
+from edge.scenes.marker.scene import simulate_tracks
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import InputError
 
