@@ -10,7 +10,7 @@ import numpy as np
 from hub.bundle.datum.gauge import fix_gauge
 from hub.bundle.initialisation import SEEN_WITHIN_S, seen_by_two
 from hub.bundle.problem import CAMERA_PARAMETERS, CENTRE, FOCAL, OFFSET, RATE, READOUT
-from hub.calibration.result import jitter_notes, readout_notes
+from hub.calibration.notes import jitter_notes, readout_notes
 from hub.calibration.rigid_body.lag import BodyPair
 from hub.calibration.rigid_body.noise import residuals
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval

@@ -12,13 +12,14 @@ import pytest
 from hub.bundle import model_comparison
 from hub.bundle.preprocessing import prepare
 from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations
-from hub.calibration import result
 from hub.calibration.incremental import update_calibration
+from hub.calibration.notes import rejected_rows
 from hub.calibration.pairs import pair_network
 from hub.calibration.pairs.pair_network import solve_pairs
-from hub.calibration.pipeline import calibrate, solve_network
+from hub.calibration.pipeline import calibrate
 from hub.calibration.resection import scan as resection_scan
 from hub.calibration.resection.scan import find_time_map
+from hub.calibration.solvers import solve_network
 from hub.calibration.triangulation import triangulate
 from hub.sync import pair_solver
 from hub.sync.pair_solver import _PairSearch
@@ -186,9 +187,9 @@ def test_a_camera_many_of_whose_rows_are_left_out_is_named() -> None:
     session = rigs.simulate(2, 3, 20.0)
     prepared, pairs = solve_pairs(prepare(session.rig, session.observations()), lambda text, share: None)
     solved = solve_network(prepared, pairs, lambda text, share: None).reconstruction
-    assert result._rejected_rows(solved.names, solved.problem, solved.state) == ()
+    assert rejected_rows(solved.names, solved.problem, solved.state) == ()
     rows = [part.using(part.use & (np.arange(len(part.use)) % 10 > 2 * part.camera)) for part in solved.problem.rows]
-    said = result._rejected_rows(solved.names, replace(solved.problem, rows=tuple(rows)), solved.state)
+    said = rejected_rows(solved.names, replace(solved.problem, rows=tuple(rows)), solved.state)
     assert [text[:4] for text in said] == solved.names[1:]
 
 
