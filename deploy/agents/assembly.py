@@ -223,7 +223,7 @@ def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:
         return LogPlayback(
             config.log.file, config.log.camera or config.id, playback_clock=playback_clock, intrinsics=intrinsics
         )
-    from edge.devices.playback.open_video import open_video
+    from edge.devices.playback.video_file import open_video
 
     assert config.video is not None  # the configuration has seen to that
     return open_video(

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from edge.agents.camera import CameraAgent
-from edge.detectors.marker.ball import MarkerModel, learn_marker_model
-from edge.detectors.marker.interactive import InteractiveMarkerDetector, learn_marker_at
+from edge.detectors.marker.ball import InteractiveMarkerDetector, MarkerModel, learn_marker_at, learn_marker_model
 from edge.devices.base import Device, DeviceInfo, Frame, WrappedDevice
 from edge.lens.solve import intrinsics_from_field_of_view
 from hub.calibration.coverage import MIN_COVERAGE

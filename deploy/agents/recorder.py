@@ -23,7 +23,7 @@ from protocols.log.write.rotation import RotatingWriter
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import PICTURE, STATUS, TOPICS
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "record"
 _TICK_S = 0.02  # between two looks at the bus: a queue holds seconds

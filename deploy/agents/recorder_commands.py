@@ -20,7 +20,7 @@ from protocols.core.errors import EXIT_DONE, InputError
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 _STATUS_S = 1.0  # as all agents: health counts 5 s without a status as dead
 _START, _STOP = "start_recording", "stop_recording"

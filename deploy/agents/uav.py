@@ -8,13 +8,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from deploy.config.uav import SimulatedFlightConfig, UavConfig
+from deploy.config.uav import SimulatedFlightConfig, UavConfig, VideoOutConfig
 from edge.devices.base import Device
 from protocols.bus.base import Bus
 from protocols.core.errors import EXIT_DONE, InputError
+from protocols.core.jpeg import encode_jpeg
 from protocols.core.version import VERSION
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
@@ -28,6 +29,64 @@ if TYPE_CHECKING:
     from edge.uav.base import Estimate
     from edge.uav.world.flight_world import FlightWorld
     from protocols.geometry.types import Image
+
+
+class OperatorVideo:
+    """The latest frame and estimate, rendered and encoded only on request. notify: called for every new frame."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._latest: tuple[Image, Estimate | None, str] | None = None
+        self.notify: Callable[[], None] = lambda: None
+
+    def update(self, image: Image, estimate: Estimate | None, line: str) -> None:
+        """Set the latest processed frame; line: text to draw on it."""
+        with self._lock:
+            # Layers refer to the tracker's current frame only.
+            self._latest = (image, None if estimate is None else replace(estimate, layers={}), line)
+        self.notify()
+
+    def render(self) -> Image | None:
+        """The latest frame (h, w, 3) BGR with the estimate drawn on it; None before the first one."""
+        from edge.uav.operator_view import draw
+
+        with self._lock:
+            newest = self._latest
+        return None if newest is None else draw(*newest)
+
+    def jpeg(self, quality: int) -> bytes | None:
+        """The rendered frame as JPEG."""
+        image = self.render()
+        return None if image is None else encode_jpeg(image, quality) or None
+
+
+def serve_video(
+    out: VideoOutConfig, size: tuple[int, int], fps: float, operator_video: OperatorVideo, stack: ExitStack
+) -> VideoStream:
+    """Serve the video until the stack is closed; returns the stream's address for ground stations.
+
+    size: (width, height) [px]. Raises InputError if it cannot be served.
+    """
+    from edge.mavlink.roles.camera_messages import VideoStream
+
+    host, _, text = out.listen.rpartition(":")
+    host, port = host.strip("[]"), int(text)
+    if out.stream == "rtsp":
+        from edge.video import rtsp_server
+
+        server = stack.enter_context(rtsp_server.RtspServer(host, port, operator_video.render, size, fps, out.kbps))
+        operator_video.notify = server.notify_frame
+        scheme, path, port = "rtsp", rtsp_server.PATH, server.port
+    else:
+        from edge.video import mjpeg_server
+
+        pages = stack.enter_context(mjpeg_server.MjpegServer(host, port, lambda: operator_video.jpeg(out.quality)))
+        operator_video.notify = pages.notify_frame
+        scheme, path, port = "http", mjpeg_server.PATH, pages.port
+    shown_host = f"[{host}]" if ":" in host else host
+    uri = out.uri or f"{scheme}://{shown_host}:{port}{path}"
+    return VideoStream("rtsp" if uri.startswith("rtsp://") else "mjpeg", uri)
+
 
 _HOVER_HEIGHT_M = 62.0  # m above the ground
 _GIMBAL_PITCH_RAD = math.radians(-62.0)
@@ -48,7 +107,7 @@ def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable
     import cv2
 
     from deploy.agents.systemd_notify import HeartbeatDevice
-    from deploy.agents.uav_video import OperatorVideo, serve_video
+    from deploy.agents.uav import OperatorVideo, serve_video
     from edge.agents.uav import UavAgent
     from edge.agents.uav_settings import UavSettings
 
@@ -235,7 +294,7 @@ def _camera(config: UavConfig) -> Iterator[tuple[Device, Intrinsics | None, Floa
         import numpy as np
 
         from edge.devices.playback.playback_clock import RealTime
-        from edge.devices.simulated.aircraft_camera import FlightCamera
+        from edge.devices.simulated.aircraft import FlightCamera
 
         flight = config.simulated or SimulatedFlightConfig()
         simulated_flight = simulate_flight(flight)

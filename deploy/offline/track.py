@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from edge.devices.base import Frame
-from edge.devices.playback.video_file import image_files
+from edge.devices.playback.video_reader import image_files
 from edge.uav.base import Basis, Box, Estimate, Telemetry, Tracker, TrackState
 from edge.uav.navigation import interpolate_positions
 from protocols.core.clocks import NANOSECONDS

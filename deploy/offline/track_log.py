@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame
+from edge.devices.playback.playback_clock import Playback
 from edge.devices.playback.video_file import VideoPlayback
 from edge.uav.estimator import decode_image
 from protocols.core.clocks import NANOSECONDS
@@ -24,7 +24,7 @@ from protocols.topics import FLIGHT_IMAGE, UAV_INFO
 _FPS = 30.0  # where the log does not tell
 
 
-class LoggedFlightImages:
+class LoggedFlightImages(Playback):
     """Images of the agent and boot with the most images. lens, body_from_camera: as known to that agent.
 
     count: images in the log. damage: what is wrong with the log, or "". repaired: images that cannot be decoded, or
@@ -33,6 +33,7 @@ class LoggedFlightImages:
     """
 
     def __init__(self, log: Path, *, fps: float | None = None, intrinsics: Intrinsics | None = None) -> None:
+        super().__init__()
         if not log.exists():
             raise InputError("this log does not exist", file=log, remedy="check the path")
         self._reader = LogReader(log)
@@ -42,32 +43,23 @@ class LoggedFlightImages:
             raise InputError(what, file=log, remedy="give the video, or record a UAV agent with [images]")
         self._chosen, self.count = names.most_common(1)[0]
         self.damage = self._reader.damage
-        self._info: pb.UavInfo | None = None
+        known: pb.UavInfo | None = None
         for logged in self._reader.messages([UAV_INFO]):
             message: Any = logged.message
             if _name(message) == self._chosen:
-                self._info = message
+                known = message
                 break
-        self.lens = intrinsics or (None if self._info is None else Intrinsics.of_message(self._info))
-        self.body_from_camera = _mounting(self._info)
+        self.lens = intrinsics or (None if known is None else Intrinsics.of_message(known))
+        self.body_from_camera = _mounting(known)
         self.repaired = 0
-        frames = self._read()
-        first = next(frames, None)
+        self._frames = self._read()
+        self._pending = first = next(self._frames, None)
         if first is None:
             raise InputError("no image of this log can be decoded", remedy="give the video itself")
-        self._frames: Iterator[Frame] = itertools.chain((first,), frames)
         self.first_s = first.device_time_ns / NANOSECONDS
         height, width = first.image.shape[:2]
-        rate = fps or (self._info.fps if self._info is not None and self._info.fps > 0.0 else _FPS)
-        self.info = DeviceInfo(width, height, rate, "log", "stream", self.lens, unknown=("exposure",))
-
-    def read(self, timeout_s: float) -> Frame | None:
-        """The next image; None after the last."""
-        return next(self._frames, None)
-
-    def close(self) -> None:
-        """May be called twice."""
-        self._frames = iter(())
+        rate = fps or (known.fps if known is not None and known.fps > 0.0 else _FPS)
+        self._info = DeviceInfo(width, height, rate, "log", "stream", self.lens, unknown=("exposure",))
 
     def _read(self) -> Iterator[Frame]:
         newest = -1

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ import tomli_w
 from deploy.offline.recognition import DETECTORS, Target, find_target
 from deploy.offline.single_target import rows_of_head_and_foot, rows_of_one_target
 from edge.detectors import base as detector_base
-from edge.detectors.base import Detector, Kind
+from edge.detectors.base import Detector
 from edge.detectors.board.description import BOARD_FILE, Board
 from edge.detectors.board.detector import BoardDetector
 from edge.detectors.marker.ball import MarkerModel
@@ -31,7 +31,7 @@ from edge.detectors.plugins import detector_revision, is_plugin, load_detector, 
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav, is_video
 from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector
 from edge.offline.sound import ENERGY_RATE, sound_energy
-from edge.offline.video import MARKER_FILE, read_marker_model
+from edge.offline.video import MARKER_FILE, detect_objects, read_marker_model
 from hub.api import RecordedSession
 from hub.clocks.sound import sound_priors
 from protocols.core.errors import InputError, Refused
@@ -315,8 +315,8 @@ def _detect_all(
                     stop.is_set,
                 )
             else:
-                one = _detect_people_or_vehicles(
-                    film, video.camera, kind, lambda text, share: report(video, text, min(share, 1.0))
+                one = detect_objects(
+                    film, video.camera, kind, None, "mog2", lambda text, share: report(video, text, min(share, 1.0))
                 )
         except InputError as error:
             with lock:
@@ -370,17 +370,6 @@ def _same_stamps(found: list[VideoDetections]) -> bool:
     return all(
         one.frames == first.frames and np.allclose(one.span, first.span, rtol=0.0, atol=_SAME_TIME_S) for one in found
     )
-
-
-def _detect_people_or_vehicles(film: VideoReader, camera: str, kind: str, progress: Progress) -> VideoDetections:
-    """Detect people or vehicles in a video, by the shipped detectors or by another one."""
-    if kind not in get_args(Kind):
-        from edge.offline.video import detect_objects
-
-        return detect_objects(film, camera, load_detector(kind, fps=film.info.fps), progress)
-    from edge.offline.moving import detect_moving, moving_detector
-
-    return detect_moving(film, camera, moving_detector(kind, "mog2", film.info.fps), progress)
 
 
 def _one_target(

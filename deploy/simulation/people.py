@@ -8,18 +8,17 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from deploy.simulation.session import TRUTH_TRAJECTORY, write_scene
+from deploy.simulation.session import TRUTH_HZ, TRUTH_TRAJECTORY, true_times, write_scene
 from edge import scenes
 from edge.scenes import renderer_for
-from edge.scenes.people.scene import PeopleScene
-from edge.scenes.people.session import PeopleTrack, simulate_people_tracks, visible_points
-from protocols.core.clocks import NANOSECONDS
+from edge.scenes.common.base import SimulatedTrack
+from edge.scenes.people.scene import PeopleScene, simulate_people_tracks, visible_points
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
 
 TRUTH_BOXES, TRUTH_PLACES = "truth_boxes.csv", "truth.csv"
 TRUTH_VIDEO_CALIBRATION = "truth_video_calibration.toml"
-_TRUTH_HZ, _PLACES_HZ = 50.0, 10.0  # a step takes half a second, a walk between two places seconds
+_PLACES_HZ = 10.0  # a walk between two places takes seconds
 
 
 def write_people_session(
@@ -65,9 +64,7 @@ def write_people_session(
 
 def _write_truth_trajectory(file: Path, scene: PeopleScene, seconds: float) -> None:
     """Write time,x,y,z,label of head tops and foot points, with times on the first camera's clock."""
-    clock = scene.cameras[0].clock
-    true_time = np.arange(0.0, seconds, 1.0 / _TRUTH_HZ)
-    camera_time = clock.epoch_ns / NANOSECONDS + clock.rate * true_time
+    true_time, camera_time = true_times(scene, seconds, TRUTH_HZ)
     lines = ["time,x,y,z,label"]
     for end, places in (("head", scene.heads(true_time)), ("foot", scene.feet(true_time))):
         for index, person in enumerate(scene.people):
@@ -80,17 +77,15 @@ def _write_truth_trajectory(file: Path, scene: PeopleScene, seconds: float) -> N
 
 def _write_truth_places(file: Path, scene: PeopleScene, seconds: float) -> None:
     """Write time,person,x,y of the foot points, with times on the first camera's clock."""
-    clock = scene.cameras[0].clock
-    true_time = np.arange(0.0, seconds, 1.0 / _PLACES_HZ)
+    true_time, camera_time = true_times(scene, seconds, _PLACES_HZ)
     lines = ["time,person,x,y"]
-    for at, places in zip(true_time, scene.feet(true_time), strict=True):
-        time = clock.epoch_ns / NANOSECONDS + clock.rate * at
+    for time, places in zip(camera_time, scene.feet(true_time), strict=True):
         for person, (x, y, _) in zip(scene.people, places, strict=True):
             lines.append(f"{time:.17g},{person.name},{x:.17g},{y:.17g}")
     write_atomically(file, "\n".join(lines) + "\n")
 
 
-def _write_truth_boxes(file: Path, scene: PeopleScene, tracks: dict[str, PeopleTrack]) -> None:
+def _write_truth_boxes(file: Path, scene: PeopleScene, tracks: dict[str, SimulatedTrack]) -> None:
     """Write the bounding boxes of all people in every frame that shows somebody, ignoring occlusion."""
     lines = ["camera,frame,time,person,x,y,w,h,head_u,head_v,foot_u,foot_v,head_seen,foot_seen"]
     for name, track in tracks.items():
@@ -106,7 +101,7 @@ def _write_truth_boxes(file: Path, scene: PeopleScene, tracks: dict[str, PeopleT
     write_atomically(file, "\n".join(lines) + "\n")
 
 
-def _write_video(out: Path, scene: PeopleScene, name: str, track: PeopleTrack, seed: int) -> str:
+def _write_video(out: Path, scene: PeopleScene, name: str, track: SimulatedTrack, seed: int) -> str:
     """Render the camera's frames into a video of constant frame rate; a lost frame repeats the one before it."""
     from edge.devices.playback.video_writer import video_writer
 

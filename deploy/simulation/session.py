@@ -10,16 +10,17 @@ import numpy as np
 import tomli_w
 
 from edge import scenes
-from edge.scenes.common.base import SimulatedScene
-from edge.scenes.marker.session import SimulatedTrack, SimulatedTracks, simulate_tracks
-from edge.scenes.people.session import PeopleTrack
+from edge.scenes.common.base import SimulatedScene, SimulatedTrack
+from edge.scenes.marker.scene import simulate_tracks
+from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.files import write_atomically
+from protocols.geometry.types import Floats
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
-from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
+from protocols.session.observations import Observations, gather_tracks
 
 TRUTH_CALIBRATION, TRUTH_TRAJECTORY = "truth_calibration.toml", "truth_trajectory.csv"
-_TRUTH_HZ = 50.0  # above every camera's frame rate
+TRUTH_HZ = 50.0  # above every camera's frame rate
 
 
 def write_simulated_session(
@@ -35,14 +36,15 @@ def write_simulated_session(
 ) -> dict[str, Any]:
     """Simulate a scene and write the session folder; returns counts. Raises InputError."""
     scene = scenes.get_marker_scene(scene_name, seed, cameras)
-    simulated = simulate_tracks(
-        scene, seconds, seed, pixel_noise=noise_px, outlier_fraction=outliers, drop_fraction=drops
-    )
-    rows = sum(len(track) for track in simulated.tracks.values())
+    tracks = simulate_tracks(scene, seconds, seed, pixel_noise=noise_px, outlier_fraction=outliers, drop_fraction=drops)
+    rows = sum(len(track) for track in tracks.values())
     if not rows:
         raise InputError("no camera saw the marker", remedy="simulate a longer time or use another seed")
-    write_scene(out, scene, scene_name, simulated.tracks)
-    _write_truth_trajectory(out / TRUTH_TRAJECTORY, simulated)
+    write_scene(out, scene, scene_name, tracks)
+    time, shown = true_times(scene, seconds, TRUTH_HZ)
+    position = scene.marker_position(time)
+    lines = [f"{t:.17g},{x:.17g},{y:.17g},{z:.17g}" for t, (x, y, z) in zip(shown, position, strict=True)]
+    write_atomically(out / TRUTH_TRAJECTORY, "\n".join(["time,x,y,z", *lines]) + "\n")
     return {"scene": scene_name, "seed": seed, "cameras": len(scene.cameras), "rows": rows, "seconds": seconds}
 
 
@@ -50,7 +52,7 @@ def write_scene(
     out: Path,
     scene: SimulatedScene,
     name: str,
-    tracks: Mapping[str, SimulatedTrack | PeopleTrack],
+    tracks: Mapping[str, SimulatedTrack],
     metadata: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Write rig.toml, observations.csv and the true calibration of a scene; returns the tables of the latter.
@@ -85,12 +87,12 @@ def camera_tables(scene: SimulatedScene, name: str) -> tuple[dict[str, Any], dic
     return rig, truth
 
 
-def simulated_observations(scene: SimulatedScene, tracks: Mapping[str, SimulatedTrack | PeopleTrack]) -> Observations:
+def simulated_observations(scene: SimulatedScene, tracks: Mapping[str, SimulatedTrack]) -> Observations:
     """The simulated detections as a session's observations; of people with two labels each."""
     found = list(tracks.values())
     return gather_tracks(
         [track.camera for track in found for _ in range(len(track))],
-        [label for track in found for label in getattr(track, "label", (DEFAULT_LABEL,) * len(track))],
+        [label for track in found for label in track.label],
         np.concatenate([track.frame for track in found]),
         np.concatenate([track.time for track in found]),
         np.concatenate([track.pixels for track in found]),
@@ -99,13 +101,7 @@ def simulated_observations(scene: SimulatedScene, tracks: Mapping[str, Simulated
     )
 
 
-def _write_truth_trajectory(file: Path, simulated: SimulatedTracks) -> None:
-    """Write time,x,y,z of the marker, with times on the first camera's clock."""
-    first = simulated.cameras[0]
-    true_time = np.arange(simulated.start, simulated.end, 1.0 / _TRUTH_HZ)
-    epoch = first.clock.epoch_ns / 1e9
-    camera_time = epoch + first.clock.rate * true_time
-    position = simulated.scene.marker_position(true_time)
-    lines = ["time,x,y,z"]
-    lines += [f"{t:.17g},{x:.17g},{y:.17g},{z:.17g}" for t, (x, y, z) in zip(camera_time, position, strict=True)]
-    write_atomically(file, "\n".join(lines) + "\n")
+def true_times(scene: SimulatedScene, seconds: float, rate_hz: float) -> tuple[Floats, Floats]:
+    """True times (n,) [s] from 0 on, and what the first camera's clock shows then [s]."""
+    clock, time = scene.cameras[0].clock, np.arange(0.0, seconds, 1.0 / rate_hz)
+    return time, np.asarray(clock.epoch_ns / NANOSECONDS + clock.rate * time)

@@ -52,9 +52,9 @@ _PRECOMPILED_MODULES = {
     "camera": "deploy.agents.assembly, edge.offline.video, deploy.agents.systemd_notify, edge.agents.camera, "
     "edge.detectors.marker.bright, edge.detectors.marker.ball, edge.detectors.marker.tag, "
     "edge.devices.playback.log_playback, edge.devices.live.network, edge.devices.live.picamera, "
-    "edge.devices.live.usb, edge.devices.playback.open_video, protocols.bus.transport.zenoh_bus",
+    "edge.devices.live.usb, edge.devices.playback.video_file, protocols.bus.transport.zenoh_bus",
     "uav": "deploy.agents.uav, deploy.agents.systemd_notify, edge.agents.uav, edge.mavlink.link.connection, "
-    "edge.uav.adaptive_tracker, edge.uav.timing.clock_alignment, scipy.interpolate, edge.devices.playback.open_video, "
+    "edge.uav.adaptive_tracker, edge.uav.timing.clock_alignment, scipy.interpolate, edge.devices.playback.video_file, "
     "protocols.bus.transport.zenoh_bus",
     "hub": "deploy.agents.assembly, hub.live.agent, hub.calibration.pipeline, hub.distributed.network.host, "
     "hub.report, hub.view.server, protocols.bus.transport.zenoh_bus",

@@ -7,7 +7,7 @@ import cv2
 from edge.devices.base import Frame
 from protocols.core.jpeg import encode_jpeg
 from protocols.messages import syncline_pb2 as pb
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 THUMBNAIL_WIDTH = 320
 """Default width of a thumbnail [px]: 8 kB as JPEG, so that fifty cameras fit a wireless link."""

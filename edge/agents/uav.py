@@ -47,7 +47,7 @@ from protocols.topics import (
     TELEMETRY,
     UAV_INFO,
 )
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "uav"
 _READ_S = 0.02  # the MAVLink connection is served between two reads

@@ -121,7 +121,7 @@ def _usb(text: str, fps: float | None, size: tuple[int, int] | None, intrinsics:
     if text.startswith("-"):
         raise InputError(f"there is no camera {text}", remedy="count USB cameras from 0")
     if text.isdecimal() and find_spec("linuxpy") is None:  # OpenCV takes the number on every operating system
-        from edge.devices.playback.open_video import open_video
+        from edge.devices.playback.video_file import open_video
 
         return open_video(int(text), fps=fps, intrinsics=intrinsics)
     from edge.devices.live.usb import open_usb

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -13,10 +12,11 @@ import tomli_w
 from edge.detectors.base import Detector, Kind
 from edge.detectors.marker.ball import MarkerModel, learn_marker_model
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
+from edge.detectors.moving.foreground import SubtractorName
 from edge.detectors.plugins import is_plugin, load_detector, unknown_detector
 from edge.devices.base import check_size
 from edge.devices.playback.video_reader import VideoReader
-from edge.offline.detections import Collected, VideoDetections, detection_rows, run_detector
+from edge.offline.detections import Collected, VideoDetections, run_detector
 from protocols.core.errors import InputError
 from protocols.core.files import read_toml
 from protocols.core.names import check_name, name_from_file
@@ -99,14 +99,8 @@ def detect_video(
     name = name_from_file(path.stem, path) if camera is None else check_name(camera, "camera")
     check_size(intrinsics, *reader.info.size, str(path))
     overlay = None if overlay is None else Path(overlay)
-    if detector == "person" or detector == "vehicle":
-        from edge.offline import moving
-
-        return moving.detect_moving(
-            reader, name, moving.moving_detector(detector, background, reader.info.fps), move, overlay
-        )
-    if not shipped:
-        return detect_objects(reader, name, load_detector(detector, kind=kind, fps=reader.info.fps), move, overlay)
+    if not shipped or detector in get_args(Kind):
+        return detect_objects(reader, name, detector, kind, background, move, overlay)
     on_frame = _frame_progress(reader, move)
     if detector == "marker":
         model = read_marker_model(Path(marker)) if isinstance(marker, str | Path) else marker or MarkerModel.default()
@@ -115,25 +109,36 @@ def detect_video(
         finder = bright_or_tag_detector("tag" if detector == "tag" else "bright", threshold, dictionary)
     drawn: Collected = {}
     found = run_detector(reader, name, finder, on_frame, collected=None if overlay is None else drawn)
-    return found if overlay is None else _with_overlay(reader, name, found, drawn, overlay)
+    if overlay is None:
+        return found
+    from edge.offline.moving import named_detections
+
+    labels = {one.label: one.label for _, seen in drawn.values() for one in seen}
+    return named_detections(reader, name, found, drawn, labels, overlay)
 
 
 def detect_objects(
     video: VideoReader,
     camera: str,
-    detector: Detector,
-    progress: Callable[[str, float], None] = lambda text, fraction: None,
+    detector: str,
+    kind: Kind | None,
+    background: SubtractorName,
+    progress: Callable[[str, float], None],
     overlay: Path | None = None,
 ) -> VideoDetections:
-    """Run another package's detector, or a network, over a video.
+    """Detect people, vehicles, or what a network or another package's detector finds; arguments as ``detect_video``'s.
 
-    Where there is never more than one person, or one vehicle, at a time, all of them are one label, ``person`` or
-    ``vehicle``, although its track was lost in between. progress, overlay: as of ``detect_video``. Raises InputError.
+    Where a network never finds more than one person, or one vehicle, at a time, all of them are one label, ``person``
+    or ``vehicle``, although its track was lost in between. Raises InputError.
     """
-    from edge.offline.moving import named_detections
+    from edge.offline.moving import detect_moving, moving_detector, named_detections
 
+    fps = video.info.fps
+    if detector in get_args(Kind):
+        return detect_moving(video, camera, moving_detector(detector, background, fps), progress, overlay)
     seen: Collected = {}
-    found = run_detector(video, camera, detector, _frame_progress(video, progress), collected=seen)
+    other = load_detector(detector, kind=kind, fps=fps)
+    found = run_detector(video, camera, other, _frame_progress(video, progress), collected=seen)
     several = {one.kind for _, shown in seen.values() for one in shown if sum(one.kind == k.kind for k in shown) > 1}
     names = {
         one.label: one.label if one.kind in several or one.kind not in get_args(Kind) else one.kind
@@ -150,16 +155,6 @@ def _frame_progress(video: VideoReader, progress: Callable[[str, float], None]) 
         progress(f"frame {frame}" + (f" of {total}" if total else ""), min(frame / total, 1.0) if total else 0.0)
 
     return on_frame
-
-
-def _with_overlay(
-    video: VideoReader, camera: str, found: VideoDetections, collected: Collected, overlay: Path
-) -> VideoDetections:
-    """Write a copy of the video with the detections drawn into it; ``found`` with its rows. Raises InputError."""
-    from edge.offline.overlay import write_overlay
-
-    write_overlay(video, overlay, {frame: [(one.label, one) for one in seen] for frame, (_, seen) in collected.items()})
-    return replace(found, rows=tuple(detection_rows(camera, collected)))
 
 
 def read_marker_model(file: Path) -> MarkerModel:

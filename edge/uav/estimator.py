@@ -25,7 +25,7 @@ from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Image
 from protocols.messages import syncline_pb2 as pb
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 _TELEMETRY_BUFFER = 200  # telemetry samples kept from before a target is selected
 _PARTICLES_EVERY, _ROAD_EVERY = 6, 15  # frames

@@ -37,6 +37,3 @@ def make_tracker(
 
         return PlainTracker(size, lens, body_from_camera, fps, seed)
     raise InputError(f"there is no model {name!r}", remedy=f"use one of {', '.join(NAMES)}")
-
-
-__all__ = ["NAMES", "make_tracker"]

@@ -189,8 +189,8 @@ def third_difference_band(basis: SplineBasis | PointBasis, weight: Floats, metri
 
 
 def third_difference_gradient(basis: SplineBasis | PointBasis, gradients: Floats) -> Floats:
-    """(3 n,): what pulls (m, 3) on the third differences are to the control points."""
-    out = np.zeros((basis.size, 3))
+    """(k n,): what pulls (m, k) on the third differences are to the control points."""
+    out = np.zeros((basis.size, gradients.shape[1]))
     index = basis.interval_starts()
     for k, coefficient in enumerate(THIRD_DIFFERENCE):
         out[index + k] += coefficient * gradients
@@ -201,7 +201,7 @@ THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
 def third_differences(basis: SplineBasis | PointBasis, control: Floats) -> Floats:
-    """(m, 3) third differences of the control points of every knot interval."""
+    """(m, k) third differences of the control points (n, k) of every knot interval."""
     index = basis.interval_starts()
     return np.asarray(sum(coefficient * control[index + k] for k, coefficient in enumerate(THIRD_DIFFERENCE)))
 

@@ -27,8 +27,6 @@ CRYSTAL_RATE_STD = 1.4e-4
 LARGE_NETWORK = 24
 """Cameras above which a network is a chain rather than a room: up to there all pairs take less than the adjustment.
 Rooms of 26 and 32 cameras come out the same to a micrometre either way, in 2 to 12 % less CPU."""
-GIVEN_PARAMETERS = 11
-"""Columns of a camera with given intrinsics; the others are never free."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

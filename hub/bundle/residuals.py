@@ -14,7 +14,6 @@ import numpy as np
 
 from hub.bundle.problem import (
     ASPECT,
-    CAMERA_PARAMETERS,
     CENTRE,
     FOCAL,
     K1,
@@ -38,21 +37,6 @@ from protocols.geometry.types import Bools, Floats, Ints
 # Knot intervals by which the path is extrapolated while clocks move: a row that a step takes off the path costs as much
 # as a gross error, so a single row at an end would otherwise block every clock update.
 _EXTRAPOLATION_INTERVALS = 0.5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LinearisedResiduals:
-    """Linearised rows of one camera and label: residual (n, 2), Jacobians, spline support.
-
-    point_jacobian: (n, 2, 3). camera_jacobian: (n, 2, columns). index (n,), weights (n, 4): control points of a row.
-    """
-
-    residual: Floats
-    point_jacobian: Floats
-    camera_jacobian: Floats
-    index: Ints
-    weights: Floats
-    valid: Bools
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -299,19 +283,3 @@ def _lens_jacobian(evaluation: ResidualEvaluation, lens: Intrinsics, column: int
     radius = np.sqrt(radius2)
     angle = np.arctan(radius)
     return normalised * (angle ** (3 + 2 * power) / np.maximum(radius, 1e-12)) * np.diag(matrix)[:, None]
-
-
-def linearise(
-    rows: TrackObservations, camera: CameraState, path: Trajectory, columns: int = CAMERA_PARAMETERS
-) -> LinearisedResiduals:
-    """Residuals of the used rows and their Jacobians by the point (n, 2, 3) and the camera (n, 2, columns)."""
-    evaluation = evaluate_residuals(rows, camera, path)
-    jacobian = jacobians(evaluation, camera, range(columns)).transpose(2, 0, 1)
-    return LinearisedResiduals(
-        evaluation.whitened(evaluation.residual).T,
-        jacobian[:, :, :3],
-        jacobian[:, :, 3:],
-        evaluation.index,
-        evaluation.weights,
-        evaluation.valid,
-    )

@@ -34,7 +34,7 @@ from hub.calibration.resection.moved_cameras import Move, moved_camera, without_
 from hub.calibration.resection.scan import other_image, scan_resection
 from hub.calibration.result import assemble_calibration
 from hub.calibration.self_calibration import focal_prior, initial_self_calibration, with_cameras, with_lens
-from hub.calibration.solution import Solution
+from hub.calibration.solvers import Solution
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.clocks.step_correction import (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,23 +19,32 @@ from hub.bundle.datum.gauge import (
     with_exact_poses,
 )
 from hub.bundle.datum.held_gauge import similarity_to_published
-from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation_times, seen_by_two, sigma_limit
-from hub.bundle.model_comparison import REFUTED_SIGMA
+from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation_times, seen_by_two
 from hub.bundle.noise.noise_scale import rescale_noise
 from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
 from hub.bundle.preprocessing import PreparedSession
-from hub.bundle.problem import CRYSTAL_RATE_STD, FOCAL, LARGE_NETWORK, READOUT, AdjustmentState, Problem
+from hub.bundle.problem import FOCAL, LARGE_NETWORK, READOUT, AdjustmentState, Problem
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
-from hub.calibration.pairs.pair_network import RATE_TOLERANCE, coincide, pair_lag
+from hub.calibration.notes import (
+    clock_step_warnings,
+    estimated_lenses,
+    jitter_notes,
+    large_residuals,
+    other_frame_rates,
+    readout_notes,
+    rejected_rows,
+    uncertain_depths,
+    unused_lengths,
+    wandering_clocks,
+    wrong_detector_stds,
+)
+from hub.calibration.pairs.pair_reports import pair_report
 from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
-from hub.calibration.solution import Solution
-from hub.sync.hypothesis import PairSolution
+from hub.calibration.solvers import Solution
 from hub.trajectory.discrete import INSTANT_TOLERANCE_S, PointBasis
-from hub.two_view.relative_pose import fundamental_from, relative_pose_between
 from protocols.core.clocks import TimeMap
-from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
@@ -44,13 +53,6 @@ from protocols.session.rig import Rig, longest_readout
 _SHORT_GAPS, _MAX_NOMINAL = 0.05, 4.0
 """Quantile of a camera's gaps between rows that stands for consecutive frames, and how much faster than those its
 nominal rate may be: a target seen in every fourth frame at best."""
-_MAX_Z = 2.0
-"""Residuals over the detector's stds, or the reverse, from which these are reported as wrong."""
-_MAX_REJECTED = 0.2
-"""Share of a camera's rows that is left out without a warning: a detector is rarely wrong more often."""
-_MAX_DEPTH_STD = 0.05
-"""Largest std of a path over its distance that its errors follow. Depth is one over disparity: of an error e of 1.96
-stds, e² is then a quarter of the depth's std, which alone is 1.36 of one std for three axes."""
 _MAX_SAMPLES = 4_000_000
 """Of one path: 4.6 hours at 240 Hz."""
 
@@ -191,23 +193,27 @@ def assemble_calibration(
         acceptance=solution.acceptance,
         convergence=reconstruction.state.steps,
         trajectories=tables,
-        pairs=tuple(_pair_report(pair, cameras, middles, state, names, solution) for pair in solution.pairs),
+        pairs=tuple(pair_report(pair, cameras, middles, state, names, solution) for pair in solution.pairs),
         warnings=solution.prepared.warnings
         + solution.warnings
         + control_outliers
-        + _unused_lengths(rig, names, reconstruction.labels)
+        + unused_lengths(rig, names, reconstruction.labels)
         + gauge.warnings
-        + _estimated_lenses(rig, cameras)
+        + estimated_lenses(rig, cameras)
         + (refuted_lens_warnings(names, problem, state, refine_lenses) if tests_lenses else ())
-        + _other_frame_rates(rig, cameras, names[reference])
-        + _rejected_rows(names, problem, state)
-        + _estimated_readouts(cameras)
-        + _estimated_jitter(names, state, time_scales)
-        + _wandering_clocks(names, state, time_scales)
-        + _clock_step_warnings(cameras)
-        + _wrong_detector_stds(cameras)
-        + _uncertain_depths(tables, state)
-        + _large_residuals(names, state),
+        + other_frame_rates(rig, cameras, names[reference])
+        + rejected_rows(names, problem, state)
+        + readout_notes(cameras, "the trajectory")
+        + (
+            ()
+            if state.jitter is None
+            else jitter_notes(names, state.jitter / np.array(time_scales), "its observations")
+        )
+        + wandering_clocks(names, state, time_scales)
+        + clock_step_warnings(cameras)
+        + wrong_detector_stds(cameras)
+        + uncertain_depths(tables, state)
+        + large_residuals(names, state),
         residuals={
             name: _residual_rows(problem, state, i, time_origins[i], time_scales[i]) for i, name in enumerate(names)
         },
@@ -268,166 +274,16 @@ def _reordered(problem: Problem, state: AdjustmentState, order: list[int]) -> tu
     )
 
 
-def _estimated_lenses(rig: Rig, cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
-    """One sentence for each lens that was estimated: unknown, refined on request, or given with a std."""
-    out = []
-    for name, camera in cameras.items():
-        given, lens, std = rig.cameras[name], camera.intrinsics, f"{100 * camera.focal_std:.2g} % (std)"
-        if camera.focal_std > 0.0 and given.is_measured and given.intrinsics is not None:
-            before = given.intrinsics.focal
-            change = f"from {before:.1f} to {lens.focal:.1f} px ± {std}, by {100 * (lens.focal / before - 1):+.2g} %"
-            weight = f"; given ± {100 * given.focal_std:.2g} %" if given.focal_std else ""
-            if weight and abs(np.log(lens.focal / before)) > REFUTED_SIGMA * given.focal_std:
-                weight += ", which the observations refute"
-            out.append(f"{name}: its lens was refined: focal length {change}{weight}")
-        elif camera.focal_std > 0.0:
-            out.append(f"{name}: its lens was estimated from the trajectory: focal length {lens.focal:.1f} px ± {std}")
-    return tuple(out)
-
-
-def _unused_lengths(rig: Rig, names: list[str], labels: list[str]) -> tuple[str, ...]:
-    """One sentence for each distance and scale bar of which an end was not solved."""
-    out = []
-    for what, given, known in (("distance", rig.distances, names), ("scale bar (wand)", rig.scale_bars, labels)):
-        for a, b, _ in given:
-            missing = " and ".join(one for one in (a, b) if one not in known)
-            if missing:
-                out.append(f"the {what} {a}–{b} was not used: no solution has {missing}")
-    return tuple(out)
-
-
-def _other_frame_rates(rig: Rig, cameras: dict[str, CameraCalibration], reference: str) -> tuple[str, ...]:
-    """One sentence for each camera whose clock rate no crystal explains."""
-    out = []
-    common = float(np.median([camera.time_map.clock_rate for camera in cameras.values()])) if len(cameras) > 2 else 1.0
-    std = float(np.median([camera.clock_rate_std for camera in cameras.values()]))
-    # Where the others agree on another rate than the reference's, it is the reference that runs differently.
-    common, whom, whose = (
-        (common, "the others", "the others'") if _is_no_crystal(common, std) else (1.0, reference, f"{reference}'s")
-    )
-    for name, camera in cameras.items():
-        rate, fps = camera.time_map.clock_rate / common, rig.cameras[name].fps
-        own = std if name == reference else camera.clock_rate_std
-        if _is_no_crystal(rate, own):
-            out.append(
-                f"{name}: its times run {1e6 * (rate - 1.0):+.0f} ± {1e6 * own:.0f} ppm against {whose}, more "
-                f"than the 100 ppm of crystals: a different frame rate, {fps / rate:.5g} fps for {fps:.5g}, or that of "
-                f"{whom}"
-            )
-    return tuple(out)
-
-
-def _is_no_crystal(rate: float, std: float) -> bool:
-    """Whether a relative clock rate, with its std, is one that no crystal explains."""
-    return abs(rate - 1.0) < RATE_TOLERANCE and (rate - 1.0) ** 2 > REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + std**2)
-
-
-def _rejected_rows(names: list[str], problem: Problem, state: AdjustmentState) -> tuple[str, ...]:
-    """One sentence for each camera many of whose rows were left out, though others saw the point then."""
-    out = []
-    for number, name in enumerate(names):
-        parts = problem.of_camera(number)
-        norms = [residual_norms(part, state.cameras[number], state.trajectories[part.label]) for part in parts]
-        seen = sum(int(np.isfinite(norm).sum()) for norm in norms)
-        left = sum(int((np.isfinite(norm) & ~part.use).sum()) for norm, part in zip(norms, parts, strict=True))
-        if left > _MAX_REJECTED * seen:
-            out.append(
-                f"{name}: {left} of its {seen} rows ({100 * left / seen:.0f} %) do not fit the others' path at its lag "
-                "and were left out: false detections, a moved camera, or a clock that is not even"
-            )
-    return tuple(out)
-
-
 def _readout(rig: Rig, name: str, found: float) -> float:
     """Readout time [s] from the first row to the last: as given, else as estimated; 0 if neither."""
     given, longest = rig.cameras[name].readout, longest_readout(rig.cameras[name].fps)
     return float(np.clip(found, -longest, longest)) if given is None else given
 
 
-def _estimated_readouts(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
-    """One sentence for each estimated rolling-shutter readout."""
-    return tuple(
-        f"{name}: its rolling-shutter readout was estimated from the trajectory: "
-        f"{1e3 * camera.readout:.1f} ms from the first row to the last ± {1e3 * camera.readout_std:.1f} ms (std)"
-        for name, camera in cameras.items()
-        if camera.readout_std > 0.0
-    )
-
-
-def _estimated_jitter(names: list[str], state: AdjustmentState, time_scales: list[float]) -> tuple[str, ...]:
-    """One sentence for each camera with time-stamp jitter."""
-    stds = np.zeros(len(names)) if state.jitter is None else state.jitter / np.array(time_scales)
-    return tuple(
-        f"{name}: its stamps jitter by {1e3 * std:.2g} ms (std): each frame's time was estimated from its observations"
-        for name, std in zip(names, stds, strict=True)
-        if std > 0.0
-    )
-
-
-def _wandering_clocks(names: list[str], state: AdjustmentState, time_scales: list[float]) -> tuple[str, ...]:
-    """One sentence for each clock that wanders."""
-    return tuple(
-        f"{names[one.camera]}: its clock's rate changes: beside an even clock it is off by up to "
-        f"{1e3 * float(np.abs(one.values).max()) / time_scales[one.camera]:.2g} ms: each frame's time was corrected, "
-        "and its time map holds at lag_time_s"
-        for one in state.wanders
-    )
-
-
-def _clock_step_warnings(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
-    """One sentence for each clock step."""
-    return tuple(
-        f"{name}: its clock steps by {1e3 * size:+.1f} ± {1e3 * std:.1g} ms at its time {time:.2f} s; its map holds "
-        f"{'before' if time > camera.lag_time else 'after'} the step, and the rows on the other side were corrected"
-        for name, camera in cameras.items()
-        for time, size, std in camera.clock_steps
-    )
-
-
-def _large_residuals(names: list[str], state: AdjustmentState) -> tuple[str, ...]:
-    """One sentence for each camera whose residuals are no noise, though no test told what they are.
-
-    They are larger than the others' as angles too: what blurs an image has more pixels in a larger one.
-    """
-    if len(names) < 3:
-        return ()
-    angles = replace(state, sigma=state.sigma / [camera.intrinsics.focal for camera in state.cameras])
-    return tuple(
-        f"{name}: its residuals ({state.sigma[i]:.2g} px a coordinate) are {3.0 * state.sigma[i] / limit:.1f} times "
-        "the others': its lens, its detections or its times are not what they are said to be, and its pose may be "
-        "further off than its std"
-        for i, name in enumerate(names)
-        if state.sigma[i] > (limit := sigma_limit(state, i)) and angles.sigma[i] > sigma_limit(angles, i)
-    )
-
-
 def _detector_z(prepared: PreparedSession, name: str, sigma: float) -> float:
     """Noise of a camera's residuals [px] over the median std that its detector states; 0 where it states none."""
     stated = prepared.camera(name).stated_std
     return sigma / stated if stated > 0.0 else 0.0
-
-
-def _wrong_detector_stds(cameras: dict[str, CameraCalibration]) -> tuple[str, ...]:
-    """One sentence for each camera whose residuals are not what its detector's covariances say."""
-    return tuple(
-        f"{name}: its residuals are {camera.detector_z:.2g} times the stds that its detector states (z-scores); only "
-        "the ratios of its covariances were used, as weights"
-        for name, camera in cameras.items()
-        if camera.detector_z > 0.0 and not 1.0 / _MAX_Z < camera.detector_z < _MAX_Z
-    )
-
-
-def _uncertain_depths(tables: Iterable[TrajectoryTable], state: AdjustmentState) -> tuple[str, ...]:
-    """One sentence for each path whose depth is known so badly that its errors are not as its stds say."""
-    out = list[str]()
-    for table in tables:
-        some = slice(None, None, 1 + len(table.std) // 100)
-        distances = [np.linalg.norm(table.position[some] - one.pose.position, axis=1) for one in state.cameras]
-        share = float(np.median(table.std[some] / np.min(distances, axis=0))) if len(table.std) else 0.0
-        if share > _MAX_DEPTH_STD:
-            text = "of its distance (std), which errors exceed: move the cameras apart"
-            out.append(f"{table.label}: its path is known to {share:.0%} {text}")
-    return tuple(out)
 
 
 def _time_map_std(
@@ -521,60 +377,3 @@ def _tables(
         std = cov.path_std(covariance, state, label, internal[good])
         out.append(TrajectoryTable(labels[label], ticks[good], position[good], std))
     return tuple(out)
-
-
-def _pair_report(
-    pair: PairSolution,
-    cameras: dict[str, CameraCalibration],
-    middles: Floats,
-    state: AdjustmentState,
-    names: list[str],
-    solution: Solution,
-) -> PairReport:
-    """Report of a pair: from the joint solution where both cameras are in it, else from the pair's own solution."""
-    fit = pair.fit
-    a, b = cameras.get(pair.a), cameras.get(pair.b)
-    if pair.fundamental is None and a is not None and b is not None:
-        middle = float(middles[names.index(pair.a), names.index(pair.b)])
-        time_a, time_b = (_camera_clock(state, names, name, middle, solution) for name in (pair.a, pair.b))
-        matrices = a.intrinsics.matrix, b.intrinsics.matrix
-        in_one_place = coincide(a.pose.position, b.pose.position)  # then they have no epipolar geometry
-        return PairReport(
-            cameras=(pair.a, pair.b),
-            status=pair.status,
-            lag_s=time_a - time_b,
-            clock_rate=b.time_map.clock_rate / a.time_map.clock_rate,
-            fundamental=None if in_one_place else fundamental_from(relative_pose_between(a.pose, b.pose), *matrices),
-            inliers=None if fit is None else fit.inliers,
-            rms_px=None if fit is None or not np.isfinite(fit.residual_px) else fit.residual_px,
-            acceptance=pair.acceptance,
-        )
-    return isolated_pair_report(pair, solution.prepared)
-
-
-def isolated_pair_report(pair: PairSolution, prepared: PreparedSession) -> PairReport:
-    """Report of a pair from its own solution, where no joint solution contains both cameras."""
-    fit = pair.fit
-    if fit is None or not pair.solved:
-        return PairReport((pair.a, pair.b), pair.status, fundamental=pair.fundamental, acceptance=pair.acceptance)
-    matrix = pair.fundamental
-    if matrix is None:
-        lenses = [prepared.camera(name).intrinsics.matrix for name in (pair.a, pair.b)]
-        matrix = fundamental_from(fit.geometry, *lenses)
-    return PairReport(
-        (pair.a, pair.b),
-        pair.status,
-        pair_lag(prepared, pair, fit),
-        fit.rate * prepared.time_scale(pair.b) / prepared.time_scale(pair.a),
-        matrix,
-        fit.inliers,
-        fit.residual_px,
-        pair.acceptance,
-    )
-
-
-def _camera_clock(state: AdjustmentState, names: list[str], name: str, internal: float, solution: Solution) -> float:
-    """Time on a camera's own clock at an internal time."""
-    prepared = solution.prepared
-    observed = float(state.cameras[names.index(name)].camera_time(np.array([internal]))[0])
-    return observed / prepared.time_scale(name) + prepared.time_origins[name]

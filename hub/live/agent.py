@@ -16,6 +16,7 @@ from hub.calibration.resection.unconnected import listed
 from hub.distributed.network.host import ROLE as NODES
 from hub.live.fair_share import FairShare
 from hub.live.live_hub import SILENT_S, LiveHub
+from hub.live.messages import rig_message
 from hub.live.shard import ROLE as SHARDS
 from hub.live.shard import Shard
 from hub.live.shedding import Shedding
@@ -39,7 +40,7 @@ from protocols.topics import (
     TRACK_SMOOTHED,
     Topic,
 )
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "hub"
 _TICK_S = 0.05  # s: of the hub's loop, below a frame at 15 Hz
@@ -262,21 +263,6 @@ def freeze_garbage_collector() -> None:
     """
     gc.collect()
     gc.freeze()
-
-
-def rig_message(rig: Rig) -> pb.RigInfo:
-    """The message with the rig's gauge and scale information, for the log."""
-    message = pb.RigInfo(schema_version=SCHEMA_VERSION, units=rig.units, clock=rig.clock)
-    for a, b, distance in rig.distances:
-        message.distances.append(pb.RigInfo.Distance(camera_a=a, camera_b=b, distance=distance))
-    if isinstance(rig.up, str):
-        message.up_camera = rig.up
-    elif rig.up is not None:
-        message.up.extend(rig.up.tolist())
-    reference = rig.metadata.get("reference")
-    if isinstance(reference, str):
-        message.reference_camera = reference
-    return message
 
 
 def status_message(

@@ -13,8 +13,9 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
-from protocols.validation.codec import MAX_PAYLOAD, SCHEMA_VERSION
-from protocols.validation.rules import MAX_TEXT
+from protocols.session.rig import Rig
+from protocols.validation.codec import MAX_PAYLOAD
+from protocols.validation.rules import MAX_TEXT, SCHEMA_VERSION
 
 
 def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[str, str]) -> pb.Calibration:
@@ -131,3 +132,18 @@ def track_messages(table: TrajectoryTable, after: float, sequence: int) -> list[
             )
         )
     return out
+
+
+def rig_message(rig: Rig) -> pb.RigInfo:
+    """The message with the rig's gauge and scale information, for the log."""
+    message = pb.RigInfo(schema_version=SCHEMA_VERSION, units=rig.units, clock=rig.clock)
+    for a, b, distance in rig.distances:
+        message.distances.append(pb.RigInfo.Distance(camera_a=a, camera_b=b, distance=distance))
+    if isinstance(rig.up, str):
+        message.up_camera = rig.up
+    elif rig.up is not None:
+        message.up.extend(rig.up.tolist())
+    reference = rig.metadata.get("reference")
+    if isinstance(reference, str):
+        message.reference_camera = reference
+    return message

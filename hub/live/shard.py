@@ -23,7 +23,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import rig_camera_from_info
 from protocols.session.calibration import Calibration
 from protocols.session.rig import Rig
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "shard"
 """Role under which a hub that shares its site's cameras is announced."""

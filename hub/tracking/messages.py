@@ -16,7 +16,7 @@ from hub.tracking.parameters import TrackerParameters, track_label
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 _COASTING_AFTER_S = 0.35  # three frames missed at 10 fps
 MARKER_COASTING_AFTER_S = 0.2  # six frames missed at 30 fps
@@ -40,20 +40,10 @@ def track_messages(
     for i in np.flatnonzero(targets.confirmed & (targets.existence >= 0.5)).tolist():
         mean, covariance, model = targets.mean[i], targets.covariance[i], TARGET_MODELS[int(targets.kind[i])]
         unseen = max(time_ns - int(targets.seen_ns[i]), 0) / NANOSECONDS
-        message = pb.Track(
-            schema_version=SCHEMA_VERSION,
-            sequence=sequence + len(out),
-            label=track_label(int(targets.kind[i]), int(targets.number[i])),
-            state="coasting" if unseen > _COASTING_AFTER_S else "confirmed",
-            reference_time_ns=time_ns,
-            position=mean[POSITION].tolist(),
-            velocity=mean[VELOCITY].tolist(),
-            position_covariance=covariance[POSITION, POSITION].ravel().tolist(),
-            velocity_covariance=covariance[VELOCITY, VELOCITY].ravel().tolist(),
-            kind=model.kind,
-            cameras=int((targets.seen_by[i] > time_ns - RECENT_NS).sum()),
-            unseen_s=unseen,
-        )
+        label = track_label(int(targets.kind[i]), int(targets.number[i]))
+        state = "coasting" if unseen > _COASTING_AFTER_S else "confirmed"
+        message = _message(label, state, time_ns, (mean, covariance), model.kind, unseen)
+        message.sequence, message.cameras = sequence + len(out), int((targets.seen_by[i] > time_ns - RECENT_NS).sum())
         if np.isfinite(angles[i]):
             message.heading = float(angles[i])
         if model.upright:
@@ -90,18 +80,27 @@ def marker_message(
     mean, covariance = moments or state.predicted(time_ns)
     unseen = (time_ns - state.time_ns) / NANOSECONDS
     detected = "confirmed" if state.confirmed else "tentative"
+    detected = "coasting" if unseen > MARKER_COASTING_AFTER_S or state.is_uncertain(covariance) else detected
+    message = _message(label, detected, time_ns, (mean, covariance), MARKER.kind, unseen)
+    message.cameras = state.cameras(time_ns)
+    return message
+
+
+def _message(
+    label: str, state: str, time_ns: int, moments: tuple[Floats, Floats], kind: str, unseen_s: float
+) -> pb.Track:
+    mean, covariance = moments
     return pb.Track(
         schema_version=SCHEMA_VERSION,
         label=label,
-        state="coasting" if unseen > MARKER_COASTING_AFTER_S or state.is_uncertain(covariance) else detected,
+        state=state,
         reference_time_ns=time_ns,
         position=mean[POSITION].tolist(),
         velocity=mean[VELOCITY].tolist(),
         position_covariance=covariance[POSITION, POSITION].ravel().tolist(),
         velocity_covariance=covariance[VELOCITY, VELOCITY].ravel().tolist(),
-        kind=MARKER.kind,
-        cameras=state.cameras(time_ns),
-        unseen_s=unseen,
+        kind=kind,
+        unseen_s=unseen_s,
     )
 
 

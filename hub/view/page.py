@@ -6,7 +6,6 @@ from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from hub.view.export import calibration_file
 from hub.view.lag_chart import lag_charts
 from hub.view.panels import camera_details, camera_table, overview, picture_tiles, recording_html
 from hub.view.scene_renderer import DisplayOptions, decode_rgb
@@ -18,6 +17,23 @@ if TYPE_CHECKING:
     import viser
 
     from hub.view.player import Player
+
+
+from hub.live.messages import calibration_from_message
+from protocols.session.builder import rig_camera_from_info
+from protocols.session.calibration import calibration_text
+from protocols.session.rig import Rig
+
+
+def calibration_file(state: ViewState) -> str:
+    """The text of calibration.toml; "" if nothing is solved yet."""
+    solved = state.solved
+    if solved is None:
+        return ""
+    infos = {name: camera.info for name, camera in state.cameras.items() if camera.info is not None}
+    rig = Rig({name: rig_camera_from_info(info) for name, info in infos.items()}, solved.units)
+    return calibration_text(calibration_from_message(solved, infos), rig)
+
 
 ACTIONS = {
     "start_recording": "Start recording",

@@ -32,7 +32,7 @@ from protocols.topics import (
     TRACK,
     UAV_INFO,
 )
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 CONTEXT_S = 20.0
 """After a seek, messages of this many seconds before are replayed; latched messages are known from the beginning."""

@@ -36,7 +36,7 @@ from protocols.topics import (
     TRACK,
     UAV_INFO,
 )
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "view"
 _TICK_S = 0.04  # a cycle while a browser is open: what moves is drawn 25 times a second [s]

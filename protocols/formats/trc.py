@@ -1,4 +1,4 @@
-"""Export of trajectories as TRC, the format of OpenSim and of Pose2Sim's results."""
+"""Export of trajectories as TRC, the format of OpenSim and of Pose2Sim's results, and as C3D, motion capture's."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.files import completed_file
 from protocols.geometry.types import Floats, Ints
 from protocols.session.rig import METRES_PER_UNIT
 from protocols.session.trajectory import read_labelled_rows
@@ -63,6 +64,34 @@ def trc_text(file: Path, name: str, units: str) -> str:
         shown = "\t".join("" if math.isnan(value) else f"{value:.9g}" for value in row)
         lines.append(f"{index + 1}\t{index / rate:.9g}\t{shown}")
     return "\n".join(lines) + "\n"
+
+
+def write_c3d(source: Path, out: Path, units: str) -> None:
+    """Write a trajectory.csv or track.csv as a C3D file at its constant rate, through ezc3d; gaps have residual -1.
+
+    units: of the trajectory; C3D files are in millimetres. Raises InputError.
+    """
+    try:
+        import ezc3d
+    except ImportError:
+        raise InputError("C3D files need ezc3d, which is not installed", remedy="pip install 'syncline[c3d]'") from None
+    grid = read_grid(source, units, "mm")
+    count, labels = len(grid.cells), len(grid.labels)
+    points = np.full((4, labels, count), np.nan)
+    points[:3] = grid.cells.reshape(count, labels, 3).transpose(2, 1, 0)
+    missing = np.isnan(points[0])
+    points[3] = np.where(missing, -1.0, 1.0)
+    file = ezc3d.c3d()
+    file["parameters"]["POINT"]["RATE"]["value"] = [grid.rate]
+    file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    file["parameters"]["POINT"]["LABELS"]["value"] = list(grid.labels)
+    file["data"]["points"] = points
+    file["data"]["meta_points"]["residuals"] = np.where(missing, -1.0, 0.0)[None]
+    try:
+        with completed_file(out) as part:
+            file.write(str(part))
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"cannot be written: {error}", file=out, remedy="choose another --out") from None
 
 
 def grid_frames(paths: Mapping[str, Floats]) -> tuple[Floats, Ints]:

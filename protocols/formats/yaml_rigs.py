@@ -197,6 +197,32 @@ def write_kalibr(cameras: Mapping[str, CameraCalibration], name: str = "camchain
     )
 
 
+def write_ros(cameras: Mapping[str, CameraCalibration]) -> ExportedFiles:
+    """ROS camera_info, one CAMERA.yaml a camera, which camera_info_manager and ``read_opencv`` read; no poses."""
+    import yaml
+
+    files = {}
+    for name, camera in cameras.items():
+        lens = camera.intrinsics
+        projection = np.column_stack([lens.matrix, np.zeros(3)])
+        document = {
+            "image_width": lens.width,
+            "image_height": lens.height,
+            "camera_name": name,
+            "camera_matrix": _ros_matrix(lens.matrix),
+            "distortion_model": "equidistant" if lens.fisheye else "plumb_bob",
+            "distortion_coefficients": _ros_matrix(lens.distortions[None]),
+            "rectification_matrix": _ros_matrix(np.eye(3)),
+            "projection_matrix": _ros_matrix(projection),
+        }
+        files[f"{name}.yaml"] = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+    return ExportedFiles(files, ("a camera_info holds no poses and no clocks: intrinsics only",))
+
+
+def _ros_matrix(values: Any) -> dict[str, Any]:
+    return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
+
+
 def _opencv_camera(values: Mapping[str, Any], text: str, file: Path) -> ForeignCamera:
     if "camera_name" in values:
         name = check_name(str(values["camera_name"]), file=file, line=_line(text, "camera_name"))

@@ -17,23 +17,7 @@ from protocols.core.names import name_of_segment
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TOPICS, Topic
 from protocols.validation.layouts import Layouts
-from protocols.validation.rules import SCHEMA_VERSION, Rejected, RejectionReason, check, check_names
-
-__all__ = [
-    "MAX_PAYLOAD",
-    "SCHEMA_VERSION",
-    "Address",
-    "Rejected",
-    "RejectionReason",
-    "admit",
-    "admit_all",
-    "decode",
-    "encode",
-    "message_class",
-    "parse_key",
-    "sender",
-    "unknown_key",
-]
+from protocols.validation.rules import Rejected, RejectionReason, check, check_names
 
 MAX_PAYLOAD = 1024 * 1024
 """Bytes. An observation with the most detections that are allowed is about two thirds of it."""

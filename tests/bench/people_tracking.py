@@ -19,7 +19,7 @@ import numpy as np
 
 from deploy.evaluation.clear_mot import EvaluationFrame, MotScores, clear_mot
 from edge import scenes
-from edge.agents.predictions import PredictionSubscriber
+from edge.agents.camera import PredictionSubscriber
 from edge.scenes import renderer_for
 from edge.scenes.common.placement import look_at_pose
 from edge.scenes.people.scene import PeopleScene

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hub.distributed.factors.factor import RAW_CAPACITY
-from hub.distributed.partition import cut, partition
+from hub.distributed.sharding import cut, partition
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import NODE_STATE, OBSERVATION, PREDICTION, TRACK
 from protocols.validation.codec import encode

@@ -13,12 +13,12 @@ import numpy as np
 
 from deploy.simulation.session import simulated_observations
 from edge import scenes
-from edge.scenes.marker.session import simulate_tracks
+from edge.scenes.marker.scene import simulate_tracks
 from hub.calibration.pipeline import calibrate
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
-from tests.support.written import rig_from_tracks
+from tests.support.written import rig_of_scene
 
 FIRST_SEED = 7000
 CAMERAS = 4
@@ -41,18 +41,18 @@ def one(seed: int, seconds: float, rate: float) -> tuple[float, int, float]:
     scene = scenes.get_marker_scene("marker", seed, CAMERAS)
     scene = replace(scene, path=Paced(scene.path, rate))
     filmed = simulate_tracks(scene, seconds, seed, pixel_noise=0.5, outlier_fraction=0.02, drop_fraction=None)
-    times = np.linspace(filmed.start, filmed.end, 200)
+    times = np.linspace(0.0, seconds, 200)
     positions = scene.marker_position(times)
     speed = float(np.mean(np.linalg.norm(np.diff(positions, axis=0), axis=1)) / (times[1] - times[0]))
     try:
-        found = calibrate(rig_from_tracks(filmed), simulated_observations(filmed.scene, filmed.tracks))
+        found = calibrate(rig_of_scene(scene), simulated_observations(scene, filmed))
     except Refused:
         return speed, 0, float("nan")
     reference = found.reference
     errors = []
     for name, camera in found.cameras.items():
-        truth = filmed.true_time_map(name, reference)
-        middle = float(np.median(filmed.tracks[name].time))
+        truth = scene.true_time_map(name, reference)
+        middle = float(np.median(filmed[name].time))
         moment = CameraTime(middle)
         off = camera.time_map.reference_from_camera(moment) - truth.reference_from_camera(moment)
         errors.append(1e3 * abs(off))

@@ -27,7 +27,8 @@ import numpy as np
 import zstandard
 from google.protobuf.message import Message
 
-from protocols.validation.codec import Rejected, admit, sender
+from protocols.validation.codec import admit, sender
+from protocols.validation.rules import Rejected
 from tests.support.samples import SAMPLES
 
 _EXTREME = (

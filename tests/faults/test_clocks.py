@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge import scenes
-from edge.scenes.marker.session import simulate_tracks
+from edge.scenes.marker.scene import simulate_tracks
 from hub.live.live_hub import LiveHub, LiveSettings
 from protocols.messages import syncline_pb2 as pb
 from tests.faults.matrix import measured
@@ -20,14 +20,14 @@ def stream(seconds: float, change: str, size: float) -> list[tuple[float, pb.Obs
     filmed = simulate_tracks(scene, seconds, 3, pixel_noise=0.3, outlier_fraction=0.0, drop_fraction=0.0)
     out: list[tuple[float, pb.Observation | pb.CameraInfo]] = []
     rng = np.random.default_rng(1)
-    for camera in filmed.cameras:
+    for camera in scene.cameras:
         lens = camera.intrinsics
         info = pb.CameraInfo(
             schema_version=1, camera=camera.name, boot_id=f"boot-{camera.name}", width=lens.width, height=lens.height,
             fps=camera.fps, matrix=lens.matrix.ravel(), distortions=lens.distortions,
         )  # fmt: skip
         out.append((0.0, info))
-        track = filmed.tracks[camera.name]
+        track = filmed[camera.name]
         start = min(t.time[0] / 1.0 for t in [track])
         for index in range(len(track)):
             time = float(track.time[index])

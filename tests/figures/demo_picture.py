@@ -12,13 +12,13 @@ import numpy as np
 from deploy.simulation.session import simulated_observations
 from edge import scenes
 from edge.scenes import renderer_for
-from edge.scenes.marker.scene import MarkerScene
-from edge.scenes.marker.session import SimulatedTracks, simulate_tracks
+from edge.scenes.common.base import SimulatedTrack
+from edge.scenes.marker.scene import MarkerScene, simulate_tracks
 from hub.calibration.pipeline import calibrate
 from protocols.geometry.pose import Pose, fit_similarity
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
-from tests.support.written import rig_from_tracks
+from tests.support.written import rig_of_scene
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "pictures" / "demo.png"
 SEED, CAMERAS, SECONDS, SHOWN = 1, 3, 20.0, 6.0
@@ -33,7 +33,7 @@ def draw(out: Path = OUT) -> None:
 
     scene = scenes.get_marker_scene("marker", SEED, CAMERAS)
     filmed = simulate_tracks(scene, SECONDS, SEED)
-    calibration = calibrate(rig_from_tracks(filmed), simulated_observations(filmed.scene, filmed.tracks))
+    calibration = calibrate(rig_of_scene(scene), simulated_observations(scene, filmed))
     figure = plt.figure(figsize=(12.6, 4.6), dpi=90)
     colours = ["#0072b2", "#d55e00", "#009e73"]
     for i, camera in enumerate(scene.cameras):
@@ -45,11 +45,11 @@ def draw(out: Path = OUT) -> None:
     figure.savefig(out, facecolor="white")
 
 
-def _draw_frame(axes, scene: MarkerScene, filmed: SimulatedTracks, name: str, colour: str) -> None:  # type: ignore[no-untyped-def]
+def _draw_frame(axes, scene: MarkerScene, filmed: dict[str, SimulatedTrack], name: str, colour: str) -> None:  # type: ignore[no-untyped-def]
     """One rendered frame with the track behind the marker."""
     image = renderer_for(scene, name, np.random.default_rng(0)).render(SHOWN)
     axes.imshow(image[:, :, ::-1])
-    track = filmed.tracks[name]
+    track = filmed[name]
     behind = (track.true_time > SHOWN - 1.5) & (track.true_time <= SHOWN)
     axes.plot(*track.pixels[behind].T, color=colour, lw=1.6)
     axes.set_axis_off()

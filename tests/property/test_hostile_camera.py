@@ -16,7 +16,8 @@ from hub.live.agent import status_message
 from hub.live.live_hub import LiveHub, LiveSettings
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS, TOPICS_BY_NAME, Topic
-from protocols.validation.codec import Rejected, admit, decode, encode
+from protocols.validation.codec import admit, decode, encode
+from protocols.validation.rules import Rejected
 from tests.faults.fuzz import spoiled
 from tests.integration.live.test_live_hub import feed, messages
 from tests.support import samples

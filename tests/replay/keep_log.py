@@ -14,7 +14,7 @@ from google.protobuf.json_format import MessageToDict
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.topics import NODE_STATE, TOPICS
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 from tests.support.samples import SAMPLES
 
 LOGS = Path(__file__).parent / "logs"

@@ -14,7 +14,7 @@ from protocols.log.write import writer
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TRACK, Topic
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 from tests.replay.keep_log import LOGS, content
 from tests.support.command_line import refusal
 from tests.support.samples import track

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations, Trajectory
+from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, CameraState, Problem, TrackObservations, Trajectory
+from hub.bundle.residuals import evaluate_residuals, jacobians
 from hub.trajectory.splines import SplineBasis, fit_spline
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Bools, Floats, Ints
 from tests.support.rigs import Path
 
 
@@ -40,4 +42,35 @@ def observed(
     return (
         Problem(tuple(rows), lenses, 0, (0, 1)),
         AdjustmentState(tuple(cameras), (path,), np.full(len(cameras), sigma)),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearisedResiduals:
+    """Linearised rows of one camera and label: residual (n, 2), Jacobians, spline support.
+
+    point_jacobian: (n, 2, 3). camera_jacobian: (n, 2, columns). index (n,), weights (n, 4): control points of a row.
+    """
+
+    residual: Floats
+    point_jacobian: Floats
+    camera_jacobian: Floats
+    index: Ints
+    weights: Floats
+    valid: Bools
+
+
+def linearise(
+    rows: TrackObservations, camera: CameraState, path: Trajectory, columns: int = CAMERA_PARAMETERS
+) -> LinearisedResiduals:
+    """Residuals of the used rows and their Jacobians by the point (n, 2, 3) and the camera (n, 2, columns)."""
+    evaluation = evaluate_residuals(rows, camera, path)
+    jacobian = jacobians(evaluation, camera, range(columns)).transpose(2, 0, 1)
+    return LinearisedResiduals(
+        evaluation.whitened(evaluation.residual).T,
+        jacobian[:, :, :3],
+        jacobian[:, :, 3:],
+        evaluation.index,
+        evaluation.weights,
+        evaluation.valid,
     )

@@ -21,18 +21,18 @@ from deploy.config.uav import SimulatedFlightConfig, UavConfig
 from edge.agents.uav import UavAgent
 from edge.agents.uav_settings import UavSettings
 from edge.devices.base import Frame
-from edge.devices.simulated.aircraft import Disturbance, SimulatedAircraft
-from edge.devices.simulated.aircraft_camera import FlightCamera
+from edge.devices.simulated.aircraft import Disturbance, FlightCamera, SimulatedAircraft
 from edge.mavlink.dialect import CAMERA
 from edge.mavlink.link.connection import Link
 from edge.mavlink.link.signing import Signing
-from edge.mavlink.link.transport import Address, Pipe
+from edge.mavlink.link.transport import Address
 from edge.mavlink.roles import camera, telemetry
 from edge.mavlink.roles.autopilot import Autopilot, LinkFaults
 from edge.mavlink.roles.camera_messages import VideoStream
 from edge.mavlink.settings import GuidanceLimits
 from edge.uav.world.flight_world import FlightWorld, GroundTruth
 from tests.support.clocks import AsFastAsPossible
+from tests.support.pipe import Pipe
 
 STEP_S = 0.01
 TRANSFER_S = 0.02

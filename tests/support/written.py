@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from deploy.simulation.session import SimulatedTracks
+from edge.scenes.common.base import SimulatedScene
 from protocols.core.files import write_atomically
 from protocols.session.calibration import Calibration, calibration_text, trajectory_text
 from protocols.session.result import result_text
@@ -27,13 +27,13 @@ def write_result(file: Path, document: dict[str, Any]) -> None:
     write_atomically(file, result_text(document))
 
 
-def rig_from_tracks(simulated: SimulatedTracks) -> Rig:
+def rig_of_scene(scene: SimulatedScene) -> Rig:
     """The rig of a simulated scene, with intrinsics but without poses."""
     return Rig(
         {
             camera.name: RigCamera(
                 camera.name, (camera.intrinsics.width, camera.intrinsics.height), camera.fps, camera.intrinsics
             )
-            for camera in simulated.cameras
+            for camera in scene.cameras
         }
     )

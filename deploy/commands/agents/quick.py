@@ -129,7 +129,7 @@ def quick(
 
 
 def _webcams(cameras: str) -> dict[str, Device]:
-    from edge.devices.playback.open_video import open_video
+    from edge.devices.playback.video_file import open_video
 
     names = [place.strip() for place in cameras.split(",") if place.strip()]
     _check_cameras(names, "--cameras")
@@ -140,7 +140,7 @@ def _webcams(cameras: str) -> dict[str, Device]:
 
 
 def _video_files(files: tuple[Path, ...]) -> dict[str, Device]:
-    from edge.devices.playback.open_video import open_video
+    from edge.devices.playback.video_file import open_video
 
     _check_cameras([str(file) for file in files], "--source")
     for file in files:

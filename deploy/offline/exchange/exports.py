@@ -6,7 +6,7 @@ from pathlib import Path
 
 from protocols.core.errors import InputError
 from protocols.core.files import file_in
-from protocols.formats import caliscope, colmap, opensfm, ros, toml_rigs, xml_export, yaml_rigs
+from protocols.formats import caliscope, colmap, opensfm, toml_rigs, xml_export, yaml_rigs
 from protocols.formats.cameras import ExportedFiles, convert_units
 from protocols.session.calibration import read_calibration
 from protocols.session.rig import METRES_PER_UNIT
@@ -31,7 +31,7 @@ def calibration_files(source: Path, to: str, out: Path) -> tuple[dict[Path, str]
     elif to == "opencv":
         written = yaml_rigs.write_opencv(cameras, rig.units)
     elif to == "ros":
-        written = ros.write(cameras)
+        written = yaml_rigs.write_ros(cameras)
     elif to == "opensfm":
         written = opensfm.write(cameras, out.name)
     elif to in xml_export.UNITS:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deploy.offline.follow.objects import BOXES_FILE, complete_detections, is_boxes_file, object_messages, read_objects
+from hub.live.messages import rig_message
 from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.errors import InputError
 from protocols.core.files import completed_file
@@ -20,7 +21,7 @@ from protocols.session.csv_table import read_csv_header
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, read_rig
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -115,7 +116,7 @@ def _write_log(out: Path, infos: Sequence[pb.CameraInfo], rig: Rig, frames: list
         raise InputError("this file exists already", file=out, remedy="choose another --out: logs are not replaced")
     begins = {message.camera: at for at, message in reversed(frames)}
     boots = {message.camera: message.boot_id for _, message in frames}
-    messages: list[tuple[int, Topic, str, Message]] = [(0, RIG_INFO, "import", _rig_info(rig))]
+    messages: list[tuple[int, Topic, str, Message]] = [(0, RIG_INFO, "import", rig_message(rig))]
     for info in infos:
         info.boot_id = boots.get(info.camera, info.boot_id)
         messages.append((begins.get(info.camera, 0), CAMERA_INFO, info.camera, info))
@@ -181,18 +182,6 @@ def camera_info(rig: Rig, name: str) -> pb.CameraInfo:
             getattr(info, key).extend(value.tolist())
     if camera.rotation is not None:
         info.rotation.extend(so3.log(camera.rotation).tolist())
-    return info
-
-
-def _rig_info(rig: Rig) -> pb.RigInfo:
-    info = pb.RigInfo(schema_version=SCHEMA_VERSION, units=rig.units, clock=rig.clock)
-    info.reference_camera = str(rig.metadata.get("reference", ""))
-    for a, b, length in rig.distances:
-        info.distances.add(camera_a=a, camera_b=b, distance=length)
-    if isinstance(rig.up, str):
-        info.up_camera = rig.up
-    elif rig.up is not None:
-        info.up.extend(rig.up.tolist())
     return info
 
 

@@ -25,7 +25,7 @@ from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.csv_table import CsvTable, read_csv_header, read_csv_table
 from protocols.session.detections import KINDS, DetectionRows, read_detections
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 Kind = Literal["person", "vehicle"]
 BOXES_FILE = "boxes.csv"

@@ -18,7 +18,7 @@ from deploy.offline.video_folder import VideoFile, list_videos
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     from deploy.offline.follow.calibration import GivenCalibration

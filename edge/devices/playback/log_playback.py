@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, check_size
-from edge.devices.playback.playback_clock import PlaybackClock, wait_until
+from edge.devices.playback.playback_clock import Playback, PlaybackClock
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.jpeg import decode_jpeg
@@ -22,12 +22,12 @@ from protocols.log.read.reader import LogReader
 from protocols.log.write.thumbnails import ThumbnailScale
 
 
-class LogPlayback:
+class LogPlayback(Playback):
     """Plays one camera's images of a log; see ``edge.devices.base.Device``.
 
     log: a file, or the folder of its parts; of a damaged one the intact part is played. camera: its name in the log; of
-    its boots the one with the most images is played. playback_clock: the clock for playback in real time; None = as
-    fast as possible. intrinsics: of the camera, at its full size or that of the images; None = those in the log.
+    its boots the one with the most images is played. playback_clock: see ``Playback``. intrinsics: of the camera, at
+    its full size or that of the images; None = those in the log.
 
     damage: description of the log's damage, known once it is open; "" if none.
     skipped: images that could not be decoded, had another size, or whose time did not increase.
@@ -41,27 +41,11 @@ class LogPlayback:
         playback_clock: PlaybackClock | None = None,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        self._log, self._camera, self._playback_clock, self._given_intrinsics = log, camera, playback_clock, intrinsics
-        self._info: DeviceInfo | None = None
-        self._frames: Iterator[Frame] = iter(())
-        self._pending: Frame | None = None
-        self._start_s: float | None = None  # playback clock time of device time 0
-        self._closed = False
+        super().__init__(playback_clock)
+        self._log, self._camera, self._given_intrinsics = log, camera, intrinsics
         self._full = (0, 0)
         self.damage = ""
         self.skipped = 0
-
-    @property
-    def info(self) -> DeviceInfo:
-        """Size of the images and their median rate."""
-        if self._info is None:
-            raise RuntimeError("open the log first")
-        return self._info
-
-    @property
-    def ended(self) -> bool:
-        """True after the last image."""
-        return self._closed or (self._info is not None and self._pending is None)
 
     def open(self) -> None:
         """Raises InputError if the log cannot be read or has no images of this camera. Reopening has no effect."""
@@ -93,23 +77,6 @@ class LogPlayback:
         readout = 0.0 if info is None else info.readout_s
         # Not the recorded clock kind: for the agent these are time stamps in a file, not this machine's clock.
         self._info = DeviceInfo(width, height, _median_rate(run), "log", "stream", lens, readout, ("exposure",))
-
-    def read(self, timeout_s: float) -> Frame | None:
-        """The next image, once it is due on the playback clock."""
-        if self._pending is None or self._closed:
-            return None
-        if self._playback_clock is not None:
-            time_s = self._pending.device_time_ns / NANOSECONDS
-            if self._start_s is None:
-                self._start_s = self._playback_clock.now() - time_s
-            if not wait_until(self._playback_clock, self._start_s + time_s, timeout_s):
-                return None
-        frame, self._pending = self._pending, next(self._frames, None)
-        return frame
-
-    def close(self) -> None:
-        """May be called twice."""
-        self._closed = True
 
     def _read(self, reader: LogReader, run: ImageRun) -> Iterator[Frame]:
         newest: int | None = None

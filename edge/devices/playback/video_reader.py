@@ -1,4 +1,4 @@
-"""Reading of all frames of a video file or an image folder with their time stamps, for offline processing.
+"""Reading of all frames of a video file or an image folder with their time stamps.
 
 Files are read with PyAV where it is installed (the extra ``video``): it gives the exact presentation time of every
 frame, and damaged frames are skipped and counted. Otherwise OpenCV reads them, which skips damaged frames silently.
@@ -7,6 +7,7 @@ frame, and damaged frames are skipped and counted. Otherwise OpenCV reads them, 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -17,15 +18,6 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from edge.devices.playback.video_file import (
-    FOLDER_FPS,
-    IMAGE_SUFFIXES,
-    VideoPlayback,
-    check_recording,
-    image_files,
-    read_image,
-)
-from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.types import Image
 
@@ -33,6 +25,9 @@ if TYPE_CHECKING:
     from av import VideoFrame as AvFrame
     from av.container import InputContainer
 
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
+FOLDER_FPS = 30.0
+"""Default frame rate of an image folder [Hz]."""
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".ts", ".3gp", ".mpg"})
 _CUT_S = 1.0  # s: durations of containers count the last frame, and often sound that goes on for longer
 _CONVERT = "check that it is a video this machine can decode (try another player, or convert it to mp4)"
@@ -48,6 +43,10 @@ class VideoFrame:
     frame: int
     time: float
     image: Callable[[], Image]
+
+
+_Decoded = tuple[float | None, tuple[int, int], Callable[[], Image]]
+"""A frame as decoded: its time [s], if stated; its size (width, height) [px]; its conversion to an image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,31 +68,29 @@ class VideoReader:
     corrupt: number of frames that could not be decoded so far. repaired: number of frames without a usable time stamp,
     placed one period after their predecessor. resized: number of frames of another size than the first, which are left
     out. cut: what a file that ends too early lacks, in words; "" = nothing.
-    Raises InputError if no frame can be read.
+    Raises InputError if no frame can be read; strict: also for an image of a folder that would be left out.
     """
 
-    def __init__(self, path: Path, fps: float | None = None) -> None:
+    def __init__(self, path: Path, fps: float | None = None, *, strict: bool = False) -> None:
         check_recording(path)
         self.path = path
         self.corrupt = 0
         self.repaired = 0
         self.resized = 0
         self.cut = ""
-        self._given_fps = fps
+        self._given_fps, self._strict = fps, strict
         if path.is_dir():
             self._image_files = image_files(path)
             self.info = self._folder_info(fps or FOLDER_FPS)
-        elif has_pyav():
-            self.info = self._file_info()
         else:
-            self.info = self._opencv_info()
+            self.info = self._file_info() if has_pyav() else self._opencv_info()
+        if not (math.isfinite(self.info.fps) and self.info.fps > 0.0):
+            raise InputError("the video states no frame rate", file=path, remedy="give its fps")
 
     def __iter__(self) -> Iterator[VideoFrame]:
         """All frames from the first one on, in order of time."""
         self.corrupt = self.repaired = self.resized = 0
-        if self.path.is_dir():
-            return self._read_folder()
-        return self._read_file() if has_pyav() else self._read_opencv()
+        return self._read_folder() if self.path.is_dir() else self._read_file()
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -119,6 +116,11 @@ class VideoReader:
         for index, file in enumerate(self._image_files):
             image = read_image(file)
             if image is None or (image.shape[1], image.shape[0]) != self.info.size:
+                if self._strict:
+                    size = (
+                        "cannot be read" if image is None else f"is {image.shape[1]}x{image.shape[0]}, others are not"
+                    )
+                    raise InputError(f"this image {size}", file=file, remedy="remove or replace it")
                 self.corrupt += image is None
                 self.resized += image is not None
                 continue
@@ -146,32 +148,35 @@ class VideoReader:
         except av.error.FFmpegError as error:
             what = f"no frame can be read from this file: {error.strerror}"
             raise InputError(what, file=self.path, remedy=_CONVERT) from None
-        if not (math.isfinite(rate) and rate > 0.0):
-            raise InputError("the video states no frame rate", file=self.path, remedy="give its fps")
         return VideoInfo(size, rate, count, end)
 
     def _read_file(self) -> Iterator[VideoFrame]:
-        import av
-
         last, frame = -math.inf, 0
-        with av.open(str(self.path)) as container:
-            for decoded in self._decoded(container):
-                if decoded.is_corrupt or upright_size(decoded) != self.info.size:
-                    self.corrupt += decoded.is_corrupt
-                    self.resized += not decoded.is_corrupt
-                    continue
-                time = decoded.time
-                if self._given_fps:
-                    time = frame / self._given_fps
-                elif time is None or not time > last:
-                    self.repaired += 1
-                    time = (last if math.isfinite(last) else 0.0) + 1.0 / self.info.fps
-                last = time
-                yield VideoFrame(frame, time, partial(upright_image, decoded))
-                frame += 1
+        for time, size, image in self._pyav_frames() if has_pyav() else self._opencv_frames():
+            if size != self.info.size:
+                self.resized += 1
+                continue
+            if self._given_fps:
+                time = frame / self._given_fps
+            elif time is None or not last < time < math.inf:
+                self.repaired += 1
+                time = (last if math.isfinite(last) else 0.0) + 1.0 / self.info.fps
+            last = time
+            yield VideoFrame(frame, time, image)
+            frame += 1
         if not self._given_fps and not self.resized and last + _CUT_S < self.info.end:
             says = f"its container says {self.info.end:.1f} s"
             self.cut = f"it ends at {last:.1f} s, {says}: the file seems to be cut off"
+
+    def _pyav_frames(self) -> Iterator[_Decoded]:
+        import av
+
+        with av.open(str(self.path)) as container:
+            for decoded in self._decoded(container):
+                if decoded.is_corrupt:
+                    self.corrupt += 1
+                else:
+                    yield decoded.time, upright_size(decoded), partial(upright_image, decoded)
 
     def _decoded(self, container: InputContainer) -> Iterator[AvFrame]:
         """The decoder's frames; packets that cannot be decoded are counted."""
@@ -193,25 +198,53 @@ class VideoReader:
                 self.corrupt += 1
 
     def _opencv_info(self) -> VideoInfo:
-        recording = VideoPlayback(self.path, fps=self._given_fps)
-        recording.open()
-        info = recording.info
-        recording.close()
+        first = next(self._opencv_frames(), None)
+        if first is None:
+            raise InputError("no frame can be read from this file", file=self.path, remedy=_CONVERT)
         capture = cv2.VideoCapture(str(self.path))
-        count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+        rate, count = (capture.get(what) for what in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
         capture.release()
-        return VideoInfo((info.width, info.height), info.fps, count)
+        return VideoInfo(first[1], self._given_fps or rate, max(int(count), 0))
 
-    def _read_opencv(self) -> Iterator[VideoFrame]:
-        recording = VideoPlayback(self.path, fps=self._given_fps)
-        recording.open()
+    def _opencv_frames(self) -> Iterator[_Decoded]:
+        capture = cv2.VideoCapture(str(self.path))
         try:
-            while (frame := recording.read(1.0)) is not None:
-                self.repaired = recording.repaired
-                decoded = frame.image
-                yield VideoFrame(frame.frame, frame.device_time_ns / NANOSECONDS, partial(np.asarray, decoded))
+            while capture.isOpened():
+                ok, image = capture.read()
+                if not ok or image is None:
+                    return
+                # After a read, this is the presentation time of the frame that was read.
+                time = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
+                yield time, (image.shape[1], image.shape[0]), partial(np.asarray, image, np.uint8)
         finally:
-            recording.close()
+            capture.release()
+
+
+def check_recording(path: Path) -> None:
+    """Raise InputError unless ``path`` is a regular file or a folder: a pipe that nobody writes to is waited for."""
+    if not path.exists():
+        raise InputError("this video does not exist", file=path, remedy="check the path")
+    if not path.is_file() and not path.is_dir():
+        raise InputError("is not a regular file", file=path, remedy="give a video file, or a folder of images")
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The images in a folder, by name, numbers by value (2.png before 10.png). Raises InputError if there are none."""
+    files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    files.sort(key=lambda file: ([int(x) if x.isdecimal() else x for x in re.split(r"(\d+)", file.name)], file.name))
+    if not files:
+        kinds = ", ".join(sorted(IMAGE_SUFFIXES))
+        raise InputError("no images in this folder", file=folder, remedy=f"put {kinds} files in it")
+    return files
+
+
+def read_image(file: Path) -> Image | None:
+    """The image (h, w, 3) BGR of a file; None if it cannot be decoded or is larger than OpenCV's limit."""
+    try:
+        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    except cv2.error:
+        return None
+    return None if image is None else np.asarray(image, dtype=np.uint8)
 
 
 def _stated_end(container: InputContainer) -> float:

@@ -6,6 +6,7 @@ World axes: z up, metres, the floor at z = 0. Time: true time [s] of the scene, 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +86,27 @@ class Renderer(ABC):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SimulatedTrack:
+    """Simulated detections of one camera, without rendering; rows in order of time.
+
+    frame: (n,). time: (n,) [s] on the camera's own clock. pixels: (n, 2) distorted pixels. size: (n,) [px]. label: n
+    names. Ground truth: true_time: (n,) [s] of the exposures; is_outlier: (n,) rows that are false detections.
+    """
+
+    camera: str
+    frame: Ints
+    time: Floats
+    pixels: Floats
+    size: Floats
+    label: tuple[str, ...]
+    true_time: Floats
+    is_outlier: Bools
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SimulatedScene:
     """A simulated scene with its cameras; a pure function of its name, seed and number of cameras.
 
@@ -102,6 +124,21 @@ class SimulatedScene:
                 return camera
         names = ", ".join(camera.name for camera in self.cameras)
         raise InputError(f"scene {self.name} has no camera {name!r}", remedy=f"use one of {names}")
+
+    def exposures(
+        self, duration_s: float, seed: int, drop_fraction: float | None
+    ) -> Iterator[tuple[SimulatedCamera, np.random.Generator, Floats, Bools]]:
+        """Each camera, its random numbers, the true times (n,) [s] of its frames, and which (n,) it delivers.
+
+        duration_s: from true time 0; every camera starts at its ``start_s``. drop_fraction: for all cameras, in place
+        of their own. The same arguments give the same exposures.
+        """
+        for index, camera in enumerate(self.cameras):
+            rng = np.random.default_rng([seed, index])
+            count = max(int((duration_s - camera.start_s) * camera.fps * camera.clock.rate), 0)
+            true_time = camera.capture_times(camera.start_s, 0, count, rng)
+            kept = rng.random(count) >= (camera.drop_fraction if drop_fraction is None else drop_fraction)
+            yield camera, rng, true_time, kept
 
     def true_time_map(self, camera: str, reference_camera: str) -> TimeMap:
         """True clock relation of two cameras: ``t_reference = clock_rate * t_camera + time_offset`` [s]."""

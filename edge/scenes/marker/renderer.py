@@ -8,30 +8,26 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.scenes.common import background
+from edge.scenes.common.background import LIGHT_WORLD
 from edge.scenes.common.base import Renderer
-from edge.scenes.common.sensor import PEDESTAL, SensorNoise, pixel_rays, subtract_pedestal
+from edge.scenes.common.sensor import PEDESTAL, SensorNoise, pixel_rays, static_background, subtract_pedestal
 from protocols.geometry.types import Floats
 
 if TYPE_CHECKING:
     from edge.scenes.marker.scene import MarkerScene
 
-BACKGROUND_STREAM = 2  # beside the streams of cameras (0) and path (1)
 _NOISE_STD = 3.0  # of a small sensor indoors, in 8-bit steps
 _MAX_STEPS = 16  # samples of one exposure
-_BACKGROUND_WIDTH = 960  # px; wider images get a background of this width, enlarged
 _AMBIENT, _DIFFUSE, _GLINT = 0.62, 0.42, 0.35  # shares of the light, of a matt ball
 
 
 class MarkerRenderer(Renderer):
     """Images of a marker scene from one camera.
 
-    noise_rng: sensor noise. noise_std: its std [8-bit steps]. The furniture comes from the scene's own seed, so that
-    all cameras see the same.
+    noise_rng: sensor noise. noise_std: its std [8-bit steps].
     """
 
     def __init__(
@@ -45,32 +41,14 @@ class MarkerRenderer(Renderer):
         self._camera = scene.camera(camera)
         self._name = camera
         lens = self._camera.intrinsics
-        self._background = self._draw_background(np.random.default_rng([scene.seed, BACKGROUND_STREAM]))
-        self._dimmed = subtract_pedestal(self._background)
+        self._dimmed = subtract_pedestal(static_background(self._camera, scene.seed, scene.room))
         self._noise = SensorNoise(lens.width, lens.height, noise_std, noise_rng)
-        self._light = self._camera.pose.rotation @ background.LIGHT_WORLD
+        self._light = self._camera.pose.rotation @ LIGHT_WORLD
 
     def render(self, true_time: float) -> npt.NDArray[np.uint8]:
         image = self._dimmed.copy()
         self._draw_marker(image, true_time)
         return self._noise.add(image)
-
-    def _draw_background(self, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-        lens, pose = self._camera.intrinsics, self._camera.pose
-        shrink = max(1.0, lens.width / _BACKGROUND_WIDTH)
-        width, height = round(lens.width / shrink), round(lens.height / shrink)
-        u = (np.arange(width) + 0.5) * lens.width / width - 0.5
-        v = (np.arange(height) + 0.5) * lens.height / height - 0.5
-        rays = pixel_rays(lens, *np.meshgrid(u, v)) @ pose.rotation
-        if self._scene.room is None:
-            image = background.field(rays, pose.position, rng)
-        else:
-            image = background.room(rays, pose.position, *self._scene.room, rng)
-        if shrink > 1.0:
-            image = np.asarray(
-                cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_CUBIC), dtype=np.uint8
-            )
-        return image
 
     def _draw_marker(self, image: npt.NDArray[np.uint8], true_time: float) -> None:
         camera, lens = self._camera, self._camera.intrinsics

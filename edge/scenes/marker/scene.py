@@ -1,4 +1,4 @@
-"""Scenes with one moving marker: a ball waved in a room, and one flown over a field."""
+"""Scenes with one moving marker: a ball waved in a room, and one flown over a field, on smooth random paths."""
 
 from __future__ import annotations
 
@@ -6,10 +6,69 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edge.scenes.common.base import SimulatedScene
+from edge.scenes.common.base import SimulatedScene, SimulatedTrack
 from edge.scenes.common.placement import MIXED_FPS, CameraPlacement, place_cameras
-from edge.scenes.common.trajectory import SmoothPath, flown_path, hand_waved_path
 from protocols.geometry.types import Floats
+from protocols.session.observations import DEFAULT_LABEL
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothPath:
+    """A trajectory (x, y, z) = centre + extent * tanh(sum of sinusoids), at a varying rate.
+
+    centre, extent: (3,) [m]; the trajectory stays inside centre ± extent. amplitude (relative to extent), frequency
+    [Hz], phase [rad]: (k, 3). pause_depth, pause_frequency [Hz], pause_phase [rad]: (p,); the path parameter runs at
+    ``1 + Σ depth cos(…)`` of the true time, so that the target nearly hovers where the sum is near −1. The frequencies
+    are random reals: no two share a period.
+    """
+
+    centre: Floats
+    extent: Floats
+    amplitude: Floats
+    frequency: Floats
+    phase: Floats
+    pause_depth: Floats
+    pause_frequency: Floats
+    pause_phase: Floats
+
+    def position(self, true_time: Floats) -> Floats:
+        """Positions (n, 3) [m] at true times (n,) [s]."""
+        t = np.asarray(true_time, dtype=np.float64)
+        angular_frequency = 2.0 * np.pi * self.pause_frequency
+        own = t + (
+            np.sin(t[:, None] * angular_frequency + self.pause_phase) * self.pause_depth / angular_frequency
+        ).sum(axis=1)
+        angle = 2.0 * np.pi * self.frequency * own[:, None, None] + self.phase
+        return np.asarray(self.centre + self.extent * np.tanh((self.amplitude * np.sin(angle)).sum(axis=1)))
+
+
+def hand_waved_path(rng: np.random.Generator, centre: Floats, extent: Floats) -> SmoothPath:
+    """A person walking in a room and waving a marker: walk below 0.2 Hz, arm up to 1.1 Hz.
+
+    centre, extent: (3,) [m]. Speeds are around 1 to 3 m/s for an extent of about 1.2 m.
+    """
+    walk, arm = 5, 5
+    frequency = np.concatenate([rng.uniform(0.04, 0.2, (walk, 3)), rng.uniform(0.35, 1.1, (arm, 3))])
+    # The arm's amplitude falls with frequency, as a limb's power does: accelerations stay human.
+    amplitude = np.concatenate([rng.uniform(0.25, 0.5, (walk, 3)), 0.11 / frequency[walk:]])
+    phase = rng.uniform(0.0, 2.0 * np.pi, frequency.shape)
+    none = np.zeros(1)
+    return SmoothPath(centre, extent, amplitude, frequency, phase, none, np.ones(1), none)
+
+
+def flown_path(rng: np.random.Generator, centre: Floats, extent: Floats) -> SmoothPath:
+    """A small drone over a field: long sweeps at up to some 15 m/s, and phases in which it nearly hovers.
+
+    centre, extent: (3,) [m].
+    """
+    sweep, turn = 4, 4
+    frequency = np.concatenate([rng.uniform(0.008, 0.04, (sweep, 3)), rng.uniform(0.05, 0.16, (turn, 3))])
+    amplitude = np.concatenate([rng.uniform(0.3, 0.6, (sweep, 3)), 0.012 / frequency[sweep:]])
+    phase = rng.uniform(0.0, 2.0 * np.pi, frequency.shape)
+    pause_phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+    depth = np.array([0.52, 0.46])
+    return SmoothPath(centre, extent, amplitude, frequency, phase, depth, rng.uniform(0.02, 0.06, 2), pause_phase)
+
 
 ORANGE_BGR = (22.0, 112.0, 246.0)  # of the demo's ball
 
@@ -112,3 +171,46 @@ def _max_view_tangent(scene: MarkerScene, camera: str) -> float:
     x, y = [-margin, lens.width + margin], [-margin, lens.height + margin]
     corners = lens.unproject(np.array([(u, v) for u in x for v in y]))
     return float(np.nan_to_num(np.hypot(corners[:, 0], corners[:, 1]), nan=2.0).max())
+
+
+def simulate_tracks(
+    scene: MarkerScene,
+    duration_s: float,
+    seed: int,
+    *,
+    pixel_noise: float = 0.1,
+    size_noise: float = 0.01,
+    outlier_fraction: float = 0.0,
+    drop_fraction: float | None = None,
+) -> dict[str, SimulatedTrack]:
+    """Simulate detections by camera, also of those that see none; arguments see ``SimulatedScene.exposures``.
+
+    pixel_noise: std of each coordinate [px]; 0.1 is that of the shipped detector. size_noise: relative std of the
+    diameter. outlier_fraction: share of rows at a uniformly random place.
+    """
+    tracks = {}
+    for camera, rng, true_time, kept in scene.exposures(duration_s, seed, drop_fraction):
+        count = len(true_time)
+        pixels, size = scene.seen_by(camera.name, true_time)
+        pixels = pixels + rng.normal(0.0, pixel_noise, (count, 2))
+        size = size * (1.0 + rng.normal(0.0, size_noise, count))
+        # A ball truncated by the image border is not detected.
+        limit = np.array([camera.intrinsics.width, camera.intrinsics.height]) - 1.0
+        reach = 0.5 * size[:, None]
+        with np.errstate(invalid="ignore"):
+            kept &= ((pixels >= reach) & (pixels <= limit - reach)).all(axis=1)
+        outlier = rng.random(count) < outlier_fraction
+        pixels = np.where(outlier[:, None], rng.uniform(0.0, 1.0, (count, 2)) * limit, pixels)
+        size = np.where(outlier, size * rng.uniform(0.5, 2.0, count), size)
+        seconds = camera.clock.stamps(true_time, rng)
+        tracks[camera.name] = SimulatedTrack(
+            camera=camera.name,
+            frame=np.flatnonzero(kept).astype(np.int64),
+            time=seconds[kept],
+            pixels=pixels[kept],
+            size=size[kept],
+            label=(DEFAULT_LABEL,) * int(kept.sum()),
+            true_time=true_time[kept],
+            is_outlier=outlier[kept],
+        )
+    return tracks

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.scenes.common.background import LIGHT_WORLD, room
+from edge.scenes.common.background import LIGHT_WORLD
 from edge.scenes.common.base import Renderer
-from edge.scenes.common.sensor import PEDESTAL, SensorNoise, pixel_rays, subtract_pedestal
+from edge.scenes.common.sensor import PEDESTAL, SensorNoise, static_background, subtract_pedestal
 from edge.scenes.people.scene import RADII, Person, joint_radii
 from edge.scenes.people.walking import JOINTS
 from protocols.geometry.types import Floats, Image
@@ -23,7 +23,6 @@ from protocols.geometry.types import Floats, Image
 if TYPE_CHECKING:
     from edge.scenes.people.scene import PeopleScene
 
-_BACKGROUND_STREAM = 2  # of the random numbers, apart from those of people and noise
 _NOISE_STD = 3.0  # 8-bit steps, of a small sensor indoors
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 _SHADE = 0.62  # share of light left in a shadow
@@ -36,8 +35,7 @@ _LIMBS = ("hip", "knee", "ankle", "toe"), ("shoulder", "elbow", "hand")
 class PeopleRenderer(Renderer):
     """Images of a people scene from one camera.
 
-    noise_rng: sensor noise. noise_std: its std [8-bit steps]. background: (H, W,
-    3) BGR in place of the scene's room.
+    noise_rng: sensor noise. noise_std: its std [8-bit steps]. background: (H, W, 3) BGR in place of the scene's room.
     """
 
     def __init__(
@@ -53,10 +51,7 @@ class PeopleRenderer(Renderer):
         self._camera = scene.camera(camera)
         lens = self._camera.intrinsics
         if background is None:
-            u, v = np.meshgrid(np.arange(lens.width, dtype=float), np.arange(lens.height, dtype=float))
-            rays = pixel_rays(lens, u, v) @ self._camera.pose.rotation
-            rng = np.random.default_rng([scene.seed, _BACKGROUND_STREAM])
-            background = room(rays, self._camera.pose.position, *scene.room, rng)
+            background = static_background(self._camera, scene.seed, scene.room)
         self.replace_background(background)
         self._noise = SensorNoise(lens.width, lens.height, noise_std, noise_rng)
         self._cloth = [_cloth(scene.seed, index, person.pattern) for index, person in enumerate(scene.people)]

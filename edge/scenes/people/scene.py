@@ -6,10 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.scenes.common.base import SimulatedScene
+from edge.scenes.common.base import SimulatedScene, SimulatedTrack
 from edge.scenes.common.placement import CameraPlacement, place_cameras
 from edge.scenes.people.walking import CROWN, WalkingPaths, body_joints, random_walks
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Bools, Floats
+
+HIDDEN_PX = 3.0
+"""A head top or foot point at least this far inside a nearer body's box is occluded."""
+
 
 MAX_PEOPLE = 12  # in the room
 ROOM = (5.0, 3.0)
@@ -76,10 +80,6 @@ class PeopleScene(SimulatedScene):
     def centres(self, true_time: Floats) -> Floats:
         """Midpoints (t, n, 3) [m] of head and foot."""
         return 0.5 * (self.heads(true_time) + self.feet(true_time))
-
-    def headings(self, true_time: Floats) -> Floats:
-        """Headings (t, n) [rad] from the x axis."""
-        return self.paths.at(true_time)[2]
 
     def seen_by(self, camera: str, points: Floats) -> Floats:
         """Distorted pixels (..., 2) of points (..., 3) [m]; NaN where they are behind the camera."""
@@ -149,3 +149,54 @@ def people_room(seed: int, cameras: int, people: int) -> PeopleScene:
         for index in range(people)
     )
     return PeopleScene("people", seed, placed_cameras, persons, random_walks(rng, people, _WALKED), ROOM)
+
+
+def simulate_people_tracks(
+    scene: PeopleScene, duration_s: float, seed: int, *, pixel_noise: float, drop_fraction: float | None = None
+) -> dict[str, SimulatedTrack]:
+    """Simulate detections by camera, labelled person0-head, person0-foot, …; size: [px] from head to foot.
+
+    pixel_noise: std of each coordinate [px]. For the others see ``SimulatedScene.exposures``.
+    """
+    tracks = {}
+    names = [(f"{one.name}-head", f"{one.name}-foot") for one in scene.people]
+    for camera, rng, true_time, kept in scene.exposures(duration_s, seed, drop_fraction):
+        seconds = camera.clock.stamps(true_time, rng)
+        pixels, visible = visible_points(scene, camera.name, true_time)
+        visible &= kept[:, None, None]
+        size = np.linalg.norm(pixels[:, :, 0] - pixels[:, :, 1], axis=-1)
+        noisy = pixels + rng.normal(0.0, pixel_noise, pixels.shape)
+        frame, person, end = np.nonzero(visible)
+        tracks[camera.name] = SimulatedTrack(
+            camera=camera.name,
+            frame=frame.astype(np.int64),
+            time=seconds[frame],
+            pixels=noisy[frame, person, end],
+            size=size[frame, person],
+            label=tuple(names[who][which_end] for who, which_end in zip(person, end, strict=True)),
+            true_time=true_time[frame],
+            is_outlier=np.zeros(len(frame), dtype=np.bool_),
+        )
+    return tracks
+
+
+def visible_points(scene: PeopleScene, camera: str, true_time: Floats) -> tuple[Floats, Bools]:
+    """Pixels (t, n, 2, 2) of head tops and foot points, and whether each is visible (t, n, 2).
+
+    Points outside the image or behind a nearer person are not visible.
+    """
+    simulated = scene.camera(camera)
+    lens = simulated.intrinsics
+    points = np.stack([scene.heads(true_time), scene.feet(true_time)], axis=2)
+    pixels = scene.seen_by(camera, points)
+    depth = simulated.pose.camera_from_world(points.reshape(-1, 3))[:, 2].reshape(points.shape[:3])
+    limit = np.array([lens.width, lens.height]) - 0.5
+    with np.errstate(invalid="ignore"):
+        visible = np.asarray(((pixels > -0.5) & (pixels < limit)).all(axis=-1), dtype=np.bool_)
+        for index, moment in enumerate(true_time):
+            boxes = scene.boxes(camera, float(moment))
+            low, high = boxes[:, :2] + HIDDEN_PX, boxes[:, :2] + boxes[:, 2:] - HIDDEN_PX
+            inside = ((pixels[index][:, :, None] > low) & (pixels[index][:, :, None] < high)).all(axis=-1)
+            nearer = depth[index].mean(axis=-1)[None, None] < depth[index].mean(axis=-1)[:, None, None]
+            visible[index] &= ~(inside & nearer).any(axis=-1)
+    return pixels, visible

@@ -2,16 +2,63 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from edge.uav.ground.road_map import RoadMap
 from edge.uav.prediction import particle_filter as pf
-from edge.uav.prediction import particle_set, path_assignment
+from edge.uav.prediction import particle_set
 from edge.uav.prediction.driver_model import DriverModel
-from edge.uav.prediction.particle_set import ParticleSet
+from edge.uav.prediction.particle_set import NO_PATH, ParticleSet
 from edge.uav.prediction.paths import RoadPath, road_edges, trace_paths
 from edge.uav.target.motion_history import MotionFit
 from protocols.geometry.types import Floats
+
+_UNKNOWN_CURVATURE_STD = 0.008  # of road that was not observed [1/unit]
+
+
+def assign_paths(particles: ParticleSet, paths: list[RoadPath], share: float, rng: np.random.Generator) -> ParticleSet:
+    """Put a share of the particles on paths that start at their position, in proportion to the path weights."""
+    n = len(particles)
+    start, heading = paths[0].points[0], paths[0].headings[0]
+    local = particles.position - start
+    arc_length = local @ np.array([np.cos(heading), np.sin(heading)])
+    lateral_offset = local @ np.array([-np.sin(heading), np.cos(heading)])
+    edges = np.cumsum([path.weight for path in paths])
+    drawn_path = np.minimum(np.searchsorted(edges, rng.random(n)), len(paths) - 1)
+    free = rng.random(n) >= share
+    curvature = np.where(free, particles.curvature, rng.normal(0.0, _UNKNOWN_CURVATURE_STD, n))
+    path = np.where(free, NO_PATH, drawn_path)
+    return replace(particles, path=path, arc_length=arc_length, lateral_offset=lateral_offset, curvature=curvature)
+
+
+def reassign_paths(
+    particles: ParticleSet, old: list[RoadPath], new: list[RoadPath], rng: np.random.Generator
+) -> ParticleSet:
+    """Change to retraced paths from the same start; a new path gets its share of the particles before its branch."""
+    successor = np.full(len(old), 0, dtype=np.int64)
+    claimed = np.zeros(len(new), bool)
+    for k, path in enumerate(old):
+        gaps = []
+        for other in new:
+            m = min(len(path.points), len(other.points))
+            gaps.append(float(np.linalg.norm(path.points[:m] - other.points[:m], axis=1).mean()))
+        successor[k] = int(np.argmin(gaps))
+        claimed[successor[k]] = True
+    assigned = np.where(particles.path == NO_PATH, NO_PATH, successor[np.maximum(particles.path, 0)])
+    for k, other in enumerate(new):
+        if claimed[k] or k == 0:
+            continue
+        base = new[0]
+        m = min(len(base.points), len(other.points))
+        diverged = np.linalg.norm(base.points[:m] - other.points[:m], axis=1) > 2.0
+        branch_length = float(np.argmax(diverged)) * 1.5 if diverged.any() else 0.0
+        eligible = (assigned == 0) & (particles.arc_length < branch_length)
+        switches = eligible & (rng.random(len(particles)) < other.weight / (other.weight + base.weight))
+        assigned = np.where(switches, k, assigned)
+    return replace(particles, path=assigned)
+
 
 _RETRACE_EVERY = 8  # frames
 _PARTICLE_COUNT = 400  # over all paths: more cost CPU, fewer leave an unlikely turn without any
@@ -70,7 +117,7 @@ class OcclusionPredictor:
             )
         if not self.paths:
             return particles
-        particles = path_assignment.assign_paths(particles, self.paths, _ON_PATH_SHARE, rng)
+        particles = assign_paths(particles, self.paths, _ON_PATH_SHARE, rng)
         is_braking = fit is not None and fit.longitudinal_acceleration < _BRAKING_ACCELERATION
         return particles if is_braking else particle_set.raise_lateral_limits(particles, self.paths[:1])
 
@@ -80,7 +127,7 @@ class OcclusionPredictor:
         if self._frames % _RETRACE_EVERY or not self.paths:
             return particles
         paths = self._trace_paths(road, time)
-        particles = path_assignment.reassign_paths(particles, self.paths, paths, rng)
+        particles = reassign_paths(particles, self.paths, paths, rng)
         self.paths = paths
         return particles
 

@@ -103,10 +103,6 @@ class MotionHistory:
         """Distance between the first and the last detection held."""
         return float(np.linalg.norm(self._positions[-1] - self._positions[0])) if len(self._positions) > 1 else 0.0
 
-    def positions(self) -> Floats:
-        """(n, 2), the oldest first."""
-        return np.array(self._positions).reshape(-1, 2)
-
     def fit(self) -> MotionFit | None:
         """Least squares of position, velocity and a small acceleration over the last second; None with < 3 detections.
 

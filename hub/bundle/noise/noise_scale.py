@@ -31,8 +31,8 @@ from hub.bundle.problem import (
 from hub.bundle.residuals import (
     StackedTrajectories,
     evaluate_labels,
+    evaluate_residuals,
     jacobians,
-    linearise,
     predict,
     residual_norms,
 )
@@ -258,9 +258,10 @@ def score_inflation(problem: Problem, state: AdjustmentState, camera: int, min_p
     parts: list[tuple[Floats, Floats]] = []
     for rows in problem.of_camera(camera):
         if np.count_nonzero(rows.use) >= 8:
-            line = linearise(rows, state.cameras[camera], state.trajectories[rows.label], OFFSET + 1)
-            score = (line.residual * line.camera_jacobian[:, :, OFFSET]).sum(axis=1)
-            parts.append((rows.stamps[rows.use][line.valid], np.column_stack([score, score])[line.valid]))
+            seen = evaluate_residuals(rows, state.cameras[camera], state.trajectories[rows.label])
+            by_time = jacobians(seen, state.cameras[camera], [OFFSET])[:, 3]
+            score = (seen.whitened(seen.residual) * by_time).sum(axis=0)
+            parts.append((rows.stamps[rows.use][seen.valid], np.column_stack([score, score])[seen.valid]))
     frames = _within_frame_inflation(parts)
     return frames * _serial_inflation(parts, frames, min_pairs)
 

@@ -23,7 +23,7 @@ from hub.bundle.initialisation import SEEN_WITHIN_S
 from hub.bundle.noise.clock_wander import Wander, fit_wander
 from hub.bundle.normal_equations import CAUCHY_WIDTH
 from hub.bundle.problem import OFFSET, AdjustmentState, Problem, TrackObservations
-from hub.bundle.residuals import LinearisedResiduals, linearise
+from hub.bundle.residuals import ResidualEvaluation, evaluate_residuals, jacobians
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry.types import Bools, Floats, Ints
 
@@ -185,10 +185,10 @@ def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: 
     """
     stamps, heights, residuals, velocities = [np.zeros(0)], [np.zeros(0)], [np.zeros((0, 2))], [np.zeros((0, 2))]
     for before, rows in zip(stamped.of_camera(camera), current.of_camera(camera), strict=True):
-        line, velocity = _velocity(rows, state)
-        residual = line.residual - velocity * (rows.time - before.time)[:, None]
+        seen, velocity = _velocity(rows, state)
+        residual = seen.whitened(seen.residual).T - velocity * (rows.time - before.time)[:, None]
         across = np.abs(_transverse(residual, velocity)) / np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
-        good = line.valid & np.isfinite(across) & _is_path_held(current, state, rows)
+        good = seen.valid & np.isfinite(across) & _is_path_held(current, state, rows)
         good &= across < _OUTLIER_SIGMA * max(
             _MAD_TO_SIGMA * float(np.median(across[good])) if good.any() else 0.0, _MIN_SIGMA_PX
         )
@@ -225,11 +225,11 @@ def _observed_times(problem: Problem, state: AdjustmentState) -> dict[int, list[
     return found
 
 
-def _velocity(rows: TrackObservations, state: AdjustmentState) -> tuple[LinearisedResiduals, Floats]:
-    """All rows linearised, and their velocities (n, 2) [px/s]."""
-    every = rows.using(np.ones(len(rows.time), dtype=np.bool_))
-    line = linearise(every, state.cameras[rows.camera], state.trajectories[rows.label], OFFSET + 1)
-    return line, line.camera_jacobian[:, :, OFFSET] * state.cameras[rows.camera].rate
+def _velocity(rows: TrackObservations, state: AdjustmentState) -> tuple[ResidualEvaluation, Floats]:
+    """Residuals of all rows, and their velocities (n, 2) [px/s]."""
+    camera, every = state.cameras[rows.camera], rows.using(np.ones(len(rows.time), dtype=np.bool_))
+    seen = evaluate_residuals(every, camera, state.trajectories[rows.label])
+    return seen, jacobians(seen, camera, [OFFSET])[:, 3].T * camera.rate
 
 
 def _clock_parameters(problem: Problem, state: AdjustmentState, camera: int, stamp: Floats, height: Floats) -> Floats:

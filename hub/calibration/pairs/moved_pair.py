@@ -57,13 +57,11 @@ _LAG_ITERATIONS, _STEP_STARTS = 2, 3  # the lag is off by a move at first; steps
 class PairDivision:
     """Where the rows of cameras a and b divide: at times (2,) [s] of their tracks.
 
-    poses: relative poses, b from a, before and after. rate, offset: ``t_a = rate t_b + offset`` [s] of both.
+    poses: relative poses, b from a, before and after.
     """
 
     times: tuple[float, float]
     poses: tuple[RelativePose, RelativePose]
-    rate: float
-    offset: float
 
     def moves(
         self, prepared: PreparedSession, names: Iterable[str], observations: Observations, keeps_later: bool | None
@@ -174,7 +172,7 @@ def find_division(a: CameraInput, b: CameraInput, time_map: tuple[float, float])
     ):
         return None
     time = 0.5 * float(rows.times[at - 1] + rows.times[at])
-    return PairDivision((time, (time - offset) / rate), (poses[0], poses[1]), rate, offset)
+    return PairDivision((time, (time - offset) / rate), (poses[0], poses[1]))
 
 
 class _Rows:

@@ -29,7 +29,7 @@ from hub.calibration.resection.scan import (
     seen_labels,
     verify,
 )
-from hub.calibration.solution import Solution
+from hub.calibration.solvers import Solution
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations
 

@@ -131,12 +131,11 @@ def _cost(
 @dataclass(frozen=True, slots=True)
 class TimeMapCandidate:
     """One lag of the moment scan. rate: internal seconds per second of the camera's track. offset: internal time [s] of
-    track time 0. score: cost over the median cost at lags with similar support; support: [s] of common motion."""
+    track time 0. score: cost over the median cost at lags with similar support."""
 
     rate: float
     offset: float
     score: float
-    support: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -274,7 +273,7 @@ def moment_scan(
             if all(abs(enough[k] - enough[other]) * _STEP_S > _DISTINCT_S for other in taken):
                 taken.append(int(k))
                 offset = moments.begin + lags[enough[k]] * _STEP_S - grid.begin
-                out.append(TimeMapCandidate(rate, float(offset), float(cost[k]) / typical, float(support[enough[k]])))
+                out.append(TimeMapCandidate(rate, float(offset), float(cost[k]) / typical))
             if len(taken) == _CANDIDATES_PER_OCTAVE:
                 break
     return out

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from hub.bundle.adjustment import apply_camera_step
+from hub.bundle.bordered_system import third_differences
 from hub.bundle.problem import CAMERA_PARAMETERS
 from hub.calibration.rigid_body.linear_system import (
     BLOCK,
@@ -25,7 +26,6 @@ from hub.calibration.rigid_body.linear_system import (
     assemble,
     camera_priors,
     linearised_rows,
-    third_differences,
     view_index,
 )
 from hub.calibration.rigid_body.motion import POSE
@@ -99,7 +99,7 @@ def _cost(problem: BodyProblem, state: BodyState, rows: list[CameraRows], robust
     for body, scatter in zip(state.bodies, state.scatter, strict=True):
         total += float((((body.control[:, 3:] ** 2).sum(axis=1) - 1.0) ** 2).sum()) / NORM_STD**2
         if scatter is not None and isinstance(body.basis, SplineBasis):
-            total += float(((third_differences(body) / scatter) ** 2).sum())
+            total += float(((third_differences(body.basis, body.control) / scatter) ** 2).sum())
     return total
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
+from hub.bundle.bordered_system import THIRD_DIFFERENCE, third_difference_gradient, third_differences
 from hub.bundle.problem import ASPECT, CENTRE, FOCAL, K1, K2, K3, OFFSET, P1, RATE, READOUT
 from hub.bundle.residuals import ResidualEvaluation, SplineSupport, evaluate_points, jacobians
 from hub.calibration.rigid_body.lag import rotations
-from hub.calibration.rigid_body.motion import POSE, BodyMotion, rotated
+from hub.calibration.rigid_body.motion import POSE, rotated
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState
 from hub.trajectory.splines import SUPPORT, SplineBasis
-from protocols.geometry.types import Floats, Ints
+from protocols.geometry.types import Bools, Floats, Ints
 
 BLOCK = SUPPORT * POSE
 """Parameters of a body's path that one view depends on."""
@@ -32,7 +34,7 @@ CAUCHY = 3.0
 class CameraRows:
     """Linearised rows of one camera at a state.
 
-    evaluation: residuals of its n rows. index: (V,) first path parameter of each view. weights, slopes: (n, 4) of the
+    evaluation: residuals of its n rows. index: (V,) first path parameter of each view. weights: (n, 4) of the
     four control points. pose_jacobian: (n, 3, 7) of the point by the interpolated pose. weight: (n,) information.
     turns: (n, 3, 3) world from body, where the shape is estimated.
     """
@@ -40,7 +42,6 @@ class CameraRows:
     evaluation: ResidualEvaluation
     index: Ints
     weights: Floats
-    slopes: Floats
     pose_jacobian: Floats
     weight: Floats
     turns: Floats | None
@@ -79,18 +80,9 @@ class ViewTerms:
 def linearised_rows(problem: BodyProblem, state: BodyState, camera: int, robust: bool) -> CameraRows:
     """A camera's rows at a state."""
     views, now = problem.views[camera], state.cameras[camera]
-    reference = now.reference_time(views.time) + state.shift[camera]
-    count = len(views.time)
-    index, inside = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.bool_)
-    weights, slopes, control = np.zeros((count, SUPPORT)), np.zeros((count, SUPPORT)), np.zeros((count, SUPPORT, POSE))
-    first = 0
-    for number, body in enumerate(state.bodies):
-        mine = views.body == number
-        if mine.any():
-            at, weight, slope, defined = body.support(reference[mine])
-            index[mine], weights[mine], slopes[mine], inside[mine] = POSE * (at + first), weight, slope, defined
-            control[mine] = body.control[at[:, None] + np.arange(SUPPORT)]
-        first += len(body.control)
+    index, weights, slopes, inside = _support(problem, state, camera)
+    every = np.concatenate([body.control for body in state.bodies])
+    control = every[index[:, None] + np.arange(SUPPORT)]
     # Rows of a rolling shutter are read at other times than the middle row: the view's pose moves on at its velocity.
     late = now.readout * now.row_offset(views.pixels) * now.rate if problem.clock else np.zeros(len(views.pixels))
     row_weights = weights[views.view] + late[:, None] * slopes[views.view]
@@ -110,20 +102,28 @@ def linearised_rows(problem: BodyProblem, state: BodyState, camera: int, robust:
     weight = information / (1.0 + squared / CAUCHY**2) if robust else np.full(len(pose), information)
     weight = np.where(found.valid & problem.use[camera], weight, 0.0)
     turns = rotations(pose[:, 3:]) if problem.free_shape else None
-    return CameraRows(found, index, row_weights, slopes[views.view], pose_jacobian, weight, turns)
+    return CameraRows(found, POSE * index, row_weights, pose_jacobian, weight, turns)
 
 
 def view_index(problem: BodyProblem, state: BodyState, camera: int) -> Ints:
     """First path parameter (V,) of each view."""
-    views, now = problem.views[camera], state.cameras[camera]
-    reference = now.reference_time(views.time) + state.shift[camera]
-    index, first = np.zeros(len(views.time), dtype=np.int64), 0
+    return POSE * _support(problem, state, camera)[0]
+
+
+def _support(problem: BodyProblem, state: BodyState, camera: int) -> tuple[Ints, Floats, Floats, Bools]:
+    """Of each view its body's first control point (V,) among all bodies', and the rest as ``BodyMotion.support``."""
+    views = problem.views[camera]
+    reference = state.cameras[camera].reference_time(views.time) + state.shift[camera]
+    index, inside = np.zeros(len(views.time), dtype=np.int64), np.zeros(len(views.time), dtype=np.bool_)
+    weights, slopes = np.zeros((2, len(views.time), SUPPORT))
+    first = 0
     for number, body in enumerate(state.bodies):
         mine = views.body == number
         if mine.any():
-            index[mine] = POSE * (body.support(reference[mine])[0] + first)
+            at, weights[mine], slopes[mine], inside[mine] = body.support(reference[mine])
+            index[mine] = at + first
         first += len(body.control)
-    return index
+    return index, weights, slopes, inside
 
 
 def assemble(problem: BodyProblem, state: BodyState, rows: list[CameraRows]) -> tuple[ReducedSystem, list[ViewTerms]]:
@@ -253,7 +253,6 @@ def _add_priors(
             place = int(starts[camera]) + columns[camera].index(column)
             system.corner[place, place] += 1.0 / std**2
             system.gradient_cameras[place] += difference / std**2
-    third = np.array([-1.0, 3.0, -3.0, 1.0])
     first = 0
     for body, scatter in zip(state.bodies, state.scatter, strict=True):
         quaternion = body.control[:, 3:]
@@ -266,16 +265,13 @@ def _add_priors(
         # Unseen instants would leave the system singular.
         system.band[0, POSE * first : POSE * (first + len(quaternion))] += 1e-9
         if scatter is not None and isinstance(body.basis, SplineBasis):
-            begin = body.basis.interval_starts()
-            value = third_differences(body)
-            for p in range(POSE):
-                for i in range(SUPPORT):
-                    np.add.at(
-                        system.gradient_path, POSE * (first + begin + i) + p, third[i] * value[:, p] / scatter[p] ** 2
-                    )
-                    for j in range(i + 1):
-                        at_j = POSE * (first + begin + j) + p
-                        np.add.at(system.band[POSE * (i - j)], at_j, third[i] * third[j] / scatter[p] ** 2)
+            begin, path = body.basis.interval_starts(), slice(POSE * first, POSE * (first + len(quaternion)))
+            pull = third_differences(body.basis, body.control) / scatter**2
+            system.gradient_path[path] += third_difference_gradient(body.basis, pull)
+            for i, j in itertools.combinations_with_replacement(range(SUPPORT), 2):
+                of_both = THIRD_DIFFERENCE[i] * THIRD_DIFFERENCE[j] / scatter**2
+                for p in range(POSE):
+                    np.add.at(system.band[POSE * (j - i)], POSE * (first + begin + i) + p, of_both[p])
         first += len(quaternion)
 
 
@@ -311,10 +307,3 @@ def camera_priors(problem: BodyProblem, state: BodyState) -> list[tuple[int, int
         ]
         out.append((camera, FOCAL, float(np.log(lens.focal / nominal.focal)), 1.0))
     return out
-
-
-def third_differences(body: BodyMotion) -> Floats:
-    """(m, 7) over every knot interval of a spline."""
-    first = body.basis.interval_starts()
-    c = body.control
-    return np.asarray(c[first + 3] - 3.0 * c[first + 2] + 3.0 * c[first + 1] - c[first])

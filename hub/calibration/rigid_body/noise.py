@@ -8,9 +8,10 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.special import chdtri
 
+from hub.bundle.bordered_system import third_differences
 from hub.bundle.problem import OFFSET
 from hub.bundle.residuals import jacobians
-from hub.calibration.rigid_body.linear_system import assemble, linearised_rows, third_differences
+from hub.calibration.rigid_body.linear_system import assemble, linearised_rows
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, pitch
 from hub.trajectory.splines import SplineBasis
 from protocols.geometry.types import Bools, Floats
@@ -94,7 +95,7 @@ def scatters(state: BodyState) -> tuple[Floats | None, ...]:
         if not isinstance(body.basis, SplineBasis):
             out.append(None)
             continue
-        third = third_differences(body)
+        third = third_differences(body.basis, body.control)
         place, turn = (float(np.sqrt(np.mean(part**2))) for part in (third[:, :3], third[:, 3:]))
         extent = max(float(np.ptp(body.control[:, :3], axis=0).max()), 1e-9)
         out.append(np.r_[np.full(3, max(place, _MIN_PRIOR * extent)), np.full(4, max(turn, _MIN_PRIOR))])

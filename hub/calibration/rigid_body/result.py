@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hub.bundle.datum.gauge import fix_gauge
+from hub.bundle.initialisation import SEEN_WITHIN_S, seen_by_two
 from hub.bundle.problem import CAMERA_PARAMETERS, CENTRE, FOCAL, OFFSET, RATE, READOUT
+from hub.calibration.notes import jitter_notes, readout_notes
 from hub.calibration.rigid_body.lag import BodyPair
 from hub.calibration.rigid_body.noise import residuals
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval
@@ -19,11 +21,10 @@ from protocols.core.clocks import TimeMap
 from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
 from protocols.geometry.pose import Similarity
-from protocols.geometry.types import Floats, Ints
+from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, FixedCalibration, TrajectoryTable
 from protocols.session.rig import Rig, longest_readout
 
-_SEEN_WITHIN = 0.2  # s: a camera sees a point at a time if it has an observation this near
 _MAX_SAMPLES = 1_000_000  # of one path
 _SCALE_CONFLICT = 0.02  # relative difference of the board's scale from the control points' that is reported
 
@@ -170,18 +171,10 @@ def _notes(
         for name, camera in cameras.items()
         if name in stds
     )
-    jitter = tuple(
-        f"{name}: its stamps jitter by {1e3 * std:.2g} ms (std): each frame's time was estimated from the board"
-        for name, std in zip(solution.names, solution.state.jitter.tolist(), strict=True)
-        if std > 0.0
+    rolling = {name: one for name, one in cameras.items() if abs(one.readout) > 3.0 * one.readout_std}
+    return (
+        lenses + jitter_notes(solution.names, solution.state.jitter, "the board") + readout_notes(rolling, "the board")
     )
-    readouts = tuple(
-        f"{name}: its rolling-shutter readout was estimated from the board: {1e3 * camera.readout:.1f} ms from the "
-        f"first row to the last ± {1e3 * camera.readout_std:.1f} ms (std)"
-        for name, camera in cameras.items()
-        if abs(camera.readout) > 3.0 * camera.readout_std > 0.0
-    )
-    return lenses + jitter + readouts
 
 
 def _trajectories(
@@ -196,8 +189,9 @@ def _trajectories(
     order = {number: i for i, number in enumerate(_moving_bodies(solution))}
     for number, place in order.items():
         motion = state.bodies[place]
-        instants = isinstance(motion.basis, PointBasis)
+        within = SEEN_WITHIN_S
         if isinstance(motion.basis, PointBasis):
+            within = INSTANT_TOLERANCE_S
             ticks = base.camera_time(motion.basis.instants) + origin
         else:
             first, last = base.camera_time(np.array([motion.basis.begin, motion.basis.end])) + origin
@@ -208,7 +202,7 @@ def _trajectories(
         for index, label in enumerate(solution.labels):
             if owner[label][0] != number:
                 continue
-            good = _observing(problem, state, index, internal, instants) >= 2
+            good = seen_by_two(_observed(problem, state, index), internal, within, within)
             point = owner[label][1] + state.shape[index]
             position = motion.points(internal[good], point)
             finite = np.isfinite(position).all(axis=1)
@@ -224,19 +218,11 @@ def _moving_bodies(solution: BodySolution) -> list[int]:
     return sorted({int(number) for views in solution.problem.views for number in np.unique(views.body)})
 
 
-def _observing(problem: BodyProblem, state: BodyState, label: int, time: Floats, instants: bool) -> Ints:
-    """Number of cameras (n,) that saw a label at internal times (n,)."""
-    within = INSTANT_TOLERANCE_S if instants else _SEEN_WITHIN
-    count = np.zeros(len(time), dtype=np.int64)
-    for views, use, camera in zip(problem.views, problem.use, state.cameras, strict=True):
-        seen = np.unique(views.view[use & (views.label == label)])
-        if not len(seen):
-            continue
-        stamps = np.sort(camera.reference_time(views.time[seen]))
-        after = np.clip(np.searchsorted(stamps, time), 0, len(stamps) - 1)
-        before = np.maximum(after - 1, 0)
-        count += np.minimum(np.abs(stamps[after] - time), np.abs(stamps[before] - time)) <= within
-    return count
+def _observed(problem: BodyProblem, state: BodyState, label: int) -> list[Floats]:
+    """Sorted internal times at which a label was observed, by camera that observed it."""
+    every = zip(problem.views, problem.use, state.cameras, strict=True)
+    seen = ((views.time[np.unique(views.view[use & (views.label == label)])], camera) for views, use, camera in every)
+    return [np.sort(camera.reference_time(times)) for times, camera in seen if len(times)]
 
 
 def _pair(

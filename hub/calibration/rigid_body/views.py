@@ -60,13 +60,12 @@ class CameraViews:
 class ViewPoses:
     """Poses of the body in camera axes: ``x_camera = rotation x_body + translation``.
 
-    time: (m,) [s]. body, view: (m,). rotation: (m, 2, 3, 3) and translation: (m, 2, 3) of the better pose and of the
+    time: (m,) [s]. body: (m,). rotation: (m, 2, 3, 3) and translation: (m, 2, 3) of the better pose and of the
     other one that fits a plane's image nearly as well; the same where there is none.
     """
 
     time: Floats
     body: Ints
-    view: Ints
     rotation: Floats
     translation: Floats
 
@@ -118,7 +117,6 @@ def view_poses(views: CameraViews, lens: Intrinsics) -> ViewPoses:
     return ViewPoses(
         views.time[index],
         views.body[index],
-        index,
         np.array([[pose[0] for pose in pair] for pair in both]).reshape(-1, 2, 3, 3),
         np.array([[pose[1] for pose in pair] for pair in both]).reshape(-1, 2, 3),
     )

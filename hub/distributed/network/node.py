@@ -39,7 +39,6 @@ from hub.distributed.network.messages import (
 from hub.distributed.network.moved_camera import EdgeJacobian, detect_motion
 from hub.distributed.network.neighbour import Neighbour
 from protocols.geometry.pose import Pose, Similarity
-from protocols.geometry.types import Floats
 
 _BATCH = 256
 """Observations processed together, unless an update comes first: the cost of a batch hardly depends on its size. CPU of
@@ -208,12 +207,6 @@ class PoseNode:
         """The edges, by neighbour."""
         return {camera: neighbour.edge for camera, neighbour in self._neighbours.items()}
 
-    def information(self) -> Floats:
-        """Information (6, 6) of the pose given the neighbours' current poses."""
-        if self.pose is None:
-            return np.zeros((6, 6))
-        return normal_equations(self.pose, self._terms(ahead=False))[0]
-
     # observations
 
     def _observation(self, seen: SharedObservation) -> list[Output]:
@@ -338,14 +331,7 @@ class PoseNode:
         frame = min(state.frame for state, _ in localised)
         localised = [neighbour for neighbour in localised if neighbour[0].frame == frame]
         pose = localise(self.camera, localised, frame)
-        if pose is None:
-            return []
-        self.pose = self._extrapolated = pose
-        self.hops = 1 + min(state.hops for state, _ in localised)
-        self.frame, self.frame_age, self._momentum = frame, 0, 0
-        self._partner = -1
-        self._depth = max(state.depth for state, _ in localised)
-        return [Notice(self.camera, "joined", f"the frame of {frame}")]
+        return self._join(pose, [state for state, _ in localised], f"the frame of {frame}")
 
     def _localise_by_resection(self) -> list[Output]:
         """Join a frame by resection from the observations shared with all neighbours."""
@@ -359,13 +345,17 @@ class PoseNode:
             if n.state is not None and n.state.frame == frame and n.state.frame_age >= _MIN_FRAME_AGE
         ]
         pose = localise_by_resection(localised, self._rng)
+        inside = [state for state in states if state.frame == frame]
+        return self._join(pose, inside, f"the frame of {frame}, by several neighbours")
+
+    def _join(self, pose: Pose | None, states: list[StateMessage], text: str) -> list[Output]:
+        """Take the pose, if there is one, in the frame of neighbours with these states."""
         if pose is None:
             return []
         self.pose = self._extrapolated = pose
-        self.hops = 1 + min(state.hops for state in states if state.frame == frame)
-        self.frame, self.frame_age, self._momentum, self._partner = frame, 0, 0, -1
-        self._depth = max(state.depth for state in states if state.frame == frame)
-        return [Notice(self.camera, "joined", f"the frame of {frame}, by several neighbours")]
+        self.hops, self._depth = 1 + min(state.hops for state in states), max(state.depth for state in states)
+        self.frame, self.frame_age, self._momentum, self._partner = states[0].frame, 0, 0, -1
+        return [Notice(self.camera, "joined", text)]
 
     def _leave_frame(self) -> None:
         """Return to the own frame; the edges are kept."""

@@ -12,7 +12,7 @@ from hub.distributed.network.messages import Anchor, ControlPoint, StateMessage
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 _UPPER = np.triu_indices(6)
 _LONGEST = 63

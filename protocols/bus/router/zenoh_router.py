@@ -21,7 +21,7 @@ from protocols.core.names import key_segment
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "router"
 _TICK_S = 0.1  # several looks at the canary in DEAD_AFTER_S

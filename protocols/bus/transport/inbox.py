@@ -14,7 +14,8 @@ from google.protobuf.message import Message
 from protocols.bus.base import AgentEvent, Received, Refusal
 from protocols.core.names import name_of_segment
 from protocols.topics import Topic
-from protocols.validation.codec import MAX_PAYLOAD, Rejected, RejectionReason, admit_all, parse_key
+from protocols.validation.codec import MAX_PAYLOAD, admit_all, parse_key
+from protocols.validation.rules import Rejected, RejectionReason
 
 MAX_BYTES = 32 * 1024 * 1024
 """Upper bound of one inbox in bytes, so that a reader that has stopped does not exhaust the memory; half of it of

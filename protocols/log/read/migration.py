@@ -12,7 +12,7 @@ from pathlib import Path
 from protocols.core.errors import InputError
 from protocols.log.layout import LOG_VERSION
 from protocols.topics import Topic
-from protocols.validation.codec import SCHEMA_VERSION
+from protocols.validation.rules import SCHEMA_VERSION
 
 Upgrade = Callable[[Topic, bytes], bytes]
 """Converts a payload of one version to the next, including its schema_version."""

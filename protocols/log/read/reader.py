@@ -35,7 +35,8 @@ from protocols.log.read.migration import upgrades_for
 from protocols.log.read.parts import find_parts, log_format
 from protocols.log.schemas import is_foxglove
 from protocols.topics import TOPICS_BY_NAME, Topic
-from protocols.validation.codec import Address, Rejected, admit, parse_key
+from protocols.validation.codec import Address, admit, parse_key
+from protocols.validation.rules import Rejected
 
 _Record = TypeVar("_Record", AttachmentRecord, Channel, MetadataRecord)
 

@@ -20,7 +20,8 @@ from protocols.log.layout import CHANNEL_RECORD, FORMAT_RECORD, LOG_VERSION, cha
 from protocols.log.schemas import schema_of
 from protocols.log.write.chunks import faster
 from protocols.topics import Topic
-from protocols.validation.codec import SCHEMA_VERSION, encode, message_class, parse_key
+from protocols.validation.codec import encode, message_class, parse_key
+from protocols.validation.rules import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     from protocols.log.write.foxglove import FoxgloveConverter

@@ -26,8 +26,7 @@ from hub.bundle.bordered_system import THIRD_DIFFERENCE, third_differences
 from hub.bundle.initialisation import _camera_state, triangulate_and_adjust
 from hub.bundle.normal_equations import build_system
 from hub.bundle.preprocessing import prepare
-from hub.bundle.problem import CAMERA_PARAMETERS, GIVEN_PARAMETERS, RATE, AdjustmentState, FreeParameters, Problem
-from hub.bundle.residuals import LinearisedResiduals, linearise
+from hub.bundle.problem import CAMERA_PARAMETERS, RATE, AdjustmentState, FreeParameters, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.calibration import final_adjustment, pipeline
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
@@ -38,7 +37,9 @@ from protocols.session.observations import read_observations
 from protocols.session.rig import read_rig
 from tests.bench.speed.rows import Limit, Row, Section
 from tests.support import rigs
+from tests.support.bundles import LinearisedResiduals, linearise
 
+GIVEN_PARAMETERS = 11  # columns of a camera with given intrinsics
 _CAMERAS = 10
 SIGMA_PX = 0.5
 _EDGE_S = 0.5

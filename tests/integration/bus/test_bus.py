@@ -16,7 +16,7 @@ from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.errors import InputError
 from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, Topic
-from protocols.validation.codec import Rejected
+from protocols.validation.rules import Rejected
 from tests.support.receiving import collect, matched, sequences
 from tests.support.samples import calibration, camera_info, eventually, observation, rig_info
 

@@ -12,7 +12,7 @@ import pytest
 
 from deploy.cli import run
 from edge import scenes
-from edge.detectors.marker.interactive import InteractiveMarkerDetector, learn_marker_at
+from edge.detectors.marker.ball import InteractiveMarkerDetector, learn_marker_at
 from edge.scenes import renderer_for
 from protocols.core.errors import InputError
 from tests.support.command_line import refusal

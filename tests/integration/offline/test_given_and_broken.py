@@ -12,13 +12,14 @@ import pytest
 from hub.bundle import model_comparison
 from hub.bundle.preprocessing import prepare
 from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations
-from hub.calibration import result
 from hub.calibration.incremental import update_calibration
+from hub.calibration.notes import rejected_rows
 from hub.calibration.pairs import pair_network
 from hub.calibration.pairs.pair_network import solve_pairs
-from hub.calibration.pipeline import calibrate, solve_network
+from hub.calibration.pipeline import calibrate
 from hub.calibration.resection import scan as resection_scan
 from hub.calibration.resection.scan import find_time_map
+from hub.calibration.solvers import solve_network
 from hub.calibration.triangulation import triangulate
 from hub.sync import pair_solver
 from hub.sync.pair_solver import _PairSearch
@@ -186,9 +187,9 @@ def test_a_camera_many_of_whose_rows_are_left_out_is_named() -> None:
     session = rigs.simulate(2, 3, 20.0)
     prepared, pairs = solve_pairs(prepare(session.rig, session.observations()), lambda text, share: None)
     solved = solve_network(prepared, pairs, lambda text, share: None).reconstruction
-    assert result._rejected_rows(solved.names, solved.problem, solved.state) == ()
+    assert rejected_rows(solved.names, solved.problem, solved.state) == ()
     rows = [part.using(part.use & (np.arange(len(part.use)) % 10 > 2 * part.camera)) for part in solved.problem.rows]
-    said = result._rejected_rows(solved.names, replace(solved.problem, rows=tuple(rows)), solved.state)
+    said = rejected_rows(solved.names, replace(solved.problem, rows=tuple(rows)), solved.state)
     assert [text[:4] for text in said] == solved.names[1:]
 
 
@@ -200,7 +201,7 @@ def test_candidates_at_other_frame_rates_do_not_displace_those_at_the_nominal_on
     prepared, pairs = solve_pairs(prepare(good.rig, good.observations()), lambda text, share: None)
     path = solve_network(prepared, pairs, lambda text, share: None).reconstruction
     scan = resection_scan.moment_scan
-    crowd = [resection_scan.TimeMapCandidate(2.0, float(lag), 0.0, 10.0) for lag in range(20)]
+    crowd = [resection_scan.TimeMapCandidate(2.0, float(lag), 0.0) for lag in range(20)]
     monkeypatch.setattr(resection_scan, "moment_scan", lambda *of: scan(*of) if of[2] == 1.0 else crowd)
     camera = prepare(session.rig, session.observations()).cameras["cam3"]
     assert find_time_map(camera, path, (1.0, 2.0))[0] == find_time_map(camera, path, (1.0,))[0]

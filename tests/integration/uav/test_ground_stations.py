@@ -14,10 +14,10 @@ import pytest
 
 from edge.devices.simulated.aircraft import SimulatedAircraft
 from edge.mavlink.dialect import mavlink as M
-from edge.mavlink.link.transport import Pipe
 from edge.mavlink.roles.autopilot import Autopilot
 from edge.uav.world import scenarios
 from tests.faults.stations import exchanged
+from tests.support.pipe import Pipe
 from tests.support.uav_flights import Air, Flight
 from tests.support.vehicle_link import URI, CameraOnLink
 

@@ -13,7 +13,7 @@ from deploy.agents.health import STATUS_TIMEOUT_S, Health, HealthServer
 from deploy.config.agents import HealthConfig
 from protocols.bus.base import Refusal
 from protocols.messages import syncline_pb2 as pb
-from protocols.validation.codec import RejectionReason
+from protocols.validation.rules import RejectionReason
 from tests.support.receiving import http_get
 
 

@@ -29,16 +29,8 @@ from protocols.topics import (
     TRACK,
     Topic,
 )
-from protocols.validation.codec import (
-    MAX_PAYLOAD,
-    Rejected,
-    RejectionReason,
-    admit,
-    admit_all,
-    decode,
-    encode,
-    parse_key,
-)
+from protocols.validation.codec import MAX_PAYLOAD, admit, admit_all, decode, encode, parse_key
+from protocols.validation.rules import Rejected, RejectionReason
 from tests.support.samples import SAMPLES, camera_info, observation, status
 
 

@@ -13,11 +13,11 @@ from deploy.agents.uav import gimbal_from_camera
 from edge.agents.target_report import update_tracking_status
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
-from edge.mavlink.link.transport import Pipe
 from edge.mavlink.roles.camera import CameraComponent
 from edge.mavlink.roles.vehicle import MountSample
 from edge.uav.navigation import Origin, rotation_from_euler, rotation_from_quaternion
 from protocols.geometry.camera import Intrinsics
+from tests.support.pipe import Pipe
 
 SIZE = (640, 480)
 LENS = Intrinsics(*SIZE, np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]))

@@ -16,8 +16,7 @@ import pytest
 from edge.agents.camera import CameraAgent
 from edge.detectors.network.boxes import BoxLabeller, NetworkBox
 from edge.devices.base import Frame
-from edge.devices.live.oak import OakCamera, OakStream, open_archive, open_stream
-from edge.devices.live.oak_network import boxes_in_image
+from edge.devices.live.oak import OakCamera, OakStream, boxes_in_image, open_archive, open_stream
 from edge.devices.settings import OakSettings
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.core.errors import InputError

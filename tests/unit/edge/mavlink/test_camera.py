@@ -11,12 +11,12 @@ import pytest
 
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
-from edge.mavlink.link.transport import Pipe
-from edge.mavlink.roles import status_texts
+from edge.mavlink.roles import camera as camera_role
 from edge.mavlink.roles.camera import ArmFollow, CameraComponent, OperatorCommand, SelectTarget, StopTracking
 from edge.mavlink.roles.camera_messages import VideoStream
 from edge.mavlink.roles.message_rates import MessageRates
 from protocols.geometry.camera import Intrinsics
+from tests.support.pipe import Pipe
 
 ACTIVE, ERROR, COASTING = 1, 2, 8
 LENS = Intrinsics(640, 480, np.array([[320.0, 0.0, 319.5], [0.0, 240.0, 239.5], [0.0, 0.0, 1.0]]))
@@ -392,7 +392,7 @@ def test_status_texts_say_what_happens_to_the_target() -> None:
     fly("lost", 1)
     fly("idle", 1)
     assert texts == ["Syncline: target lost, select it again", "Syncline: tracking stopped"]
-    assert all(len(text) <= 50 for text, _ in status_texts._TEXTS.values())
+    assert all(len(text) <= 50 for text, _ in camera_role._TEXTS.values())
 
 
 def test_only_a_station_arms_following_and_only_at_the_camera() -> None:

@@ -13,11 +13,11 @@ import pytest
 from edge.agents.uav_guidance import GuidanceControl
 from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
-from edge.mavlink.link.transport import Pipe
 from edge.mavlink.roles.guidance import Guidance, GuidanceTarget
 from edge.mavlink.settings import GuidanceLimits
 from edge.uav.base import Estimate, TrackState
 from edge.uav.navigation import Origin
+from tests.support.pipe import Pipe
 
 ORIGIN = Origin(47.4, 8.5, 480.0)
 VEHICLE, STILL = np.array([0.0, 0.0, -50.0]), np.zeros(3)

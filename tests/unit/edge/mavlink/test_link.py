@@ -17,8 +17,9 @@ from edge.mavlink.link import signing as signing_module
 from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.link.framing import Framer
 from edge.mavlink.link.signing import EPOCH_UNIX_S, TICKS, Signing, read_key, ticks
-from edge.mavlink.link.transport import Pipe, parse_url
+from edge.mavlink.link.transport import parse_url
 from protocols.core.errors import InputError
+from tests.support.pipe import Pipe
 
 KEY = bytes(range(32))
 UNIX_S = 1_700_000_000.0

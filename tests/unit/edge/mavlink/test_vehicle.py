@@ -13,10 +13,10 @@ import pytest
 from edge.agents.target_report import update_tracking_status
 from edge.mavlink.dialect import AUTOPILOT, GIMBAL, mavlink
 from edge.mavlink.link.connection import Link, ReceivedMessage
-from edge.mavlink.link.transport import Pipe
 from edge.mavlink.roles.camera_messages import CameraMessages
 from edge.mavlink.roles.vehicle import MountSample, Vehicle
 from edge.uav.navigation import Origin
+from tests.support.pipe import Pipe
 
 BOOT_S, DELAY_S = 123.0, 0.01
 COMPANION = 191

@@ -7,7 +7,7 @@ import pytest
 
 from edge import scenes
 from edge.scenes.people.renderer import PeopleRenderer
-from edge.scenes.people.session import simulate_people_tracks, visible_points
+from edge.scenes.people.scene import simulate_people_tracks, visible_points
 from protocols.core.errors import InputError
 
 

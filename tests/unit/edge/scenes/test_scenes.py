@@ -13,7 +13,7 @@ from edge import scenes
 from edge.scenes import renderer_for
 from edge.scenes.common.base import SimulatedClock
 from edge.scenes.marker import renderer as rendering
-from edge.scenes.marker.session import simulate_tracks
+from edge.scenes.marker.scene import simulate_tracks
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import InputError
 
@@ -35,8 +35,8 @@ def test_a_scene_is_a_function_of_its_name_and_seed(name: str) -> None:
 def test_simulated_detections_and_images_are_functions_of_their_seed() -> None:
     scene = scenes.get_marker_scene("marker", 2)
     a, b = simulate_tracks(scene, 5.0, 3), simulate_tracks(scene, 5.0, 3)
-    assert (a.tracks["cam1"].pixels == b.tracks["cam1"].pixels).all()
-    assert (a.tracks["cam1"].time == b.tracks["cam1"].time).all()
+    assert (a["cam1"].pixels == b["cam1"].pixels).all()
+    assert (a["cam1"].time == b["cam1"].time).all()
     one, two = (renderer_for(scene, "cam1", np.random.default_rng(4)).render(1.0) for _ in range(2))
     assert (one == two).all()
 
@@ -48,7 +48,7 @@ def test_any_number_of_cameras_is_separated_and_sees_the_marker(cameras: int) ->
     centres = np.array([camera.pose.position for camera in scene.cameras])
     separation = np.linalg.norm(centres[:, None] - centres, axis=2) + 10.0 * np.eye(cameras)
     assert separation.min() > 0.2
-    for track in simulate_tracks(scene, 30.0, 0).tracks.values():
+    for track in simulate_tracks(scene, 30.0, 0).values():
         assert len(track) > 400
 
 
@@ -152,7 +152,7 @@ def test_a_ball_behind_or_beside_the_camera_is_not_drawn() -> None:
     hidden = dataclasses.replace(scene, path=dataclasses.replace(scene.path, centre=behind, extent=np.full(3, 1e-3)))
     assert np.isnan(hidden.seen_by(camera.name, np.zeros(1))[0]).all()
     renderer = rendering.MarkerRenderer(hidden, camera.name, np.random.default_rng(0), noise_std=0.0)
-    assert (renderer.render(0.0) == np.maximum(renderer._background, 20)).all()
+    assert (renderer.render(0.0) == renderer._dimmed + np.uint8(20)).all()
 
 
 def test_a_rolling_shutter_sees_upper_rows_earlier() -> None:
@@ -172,9 +172,9 @@ def test_a_rolling_shutter_sees_upper_rows_earlier() -> None:
 
 def test_a_session_has_the_noise_outliers_and_drops_it_was_asked_for() -> None:
     scene = scenes.get_marker_scene("marker", 4)
-    session = simulate_tracks(scene, 60.0, 1, pixel_noise=0.5, size_noise=0.05, outlier_fraction=0.1, drop_fraction=0.3)
+    tracks = simulate_tracks(scene, 60.0, 1, pixel_noise=0.5, size_noise=0.05, outlier_fraction=0.1, drop_fraction=0.3)
     for camera in scene.cameras:
-        track = session.tracks[camera.name]
+        track = tracks[camera.name]
         truth, size = scene.seen_by(camera.name, track.true_time)
         inlier = ~track.is_outlier
         assert np.std((track.pixels - truth)[inlier]) == pytest.approx(0.5, rel=0.05)
@@ -188,5 +188,5 @@ def test_a_session_has_the_noise_outliers_and_drops_it_was_asked_for() -> None:
         expected = np.array([camera.clock.device_time_ns(t) for t in track.true_time]) / 1e9
         assert np.std(track.time - expected) == pytest.approx(50e-6, rel=0.1)
         assert np.std(np.diff(track.true_time)[np.diff(track.frame) == 1]) > 0.3 * camera.jitter_s
-        position = session.marker_position(camera.name, track.time)
+        position = scene.marker_position((track.time - camera.clock.epoch_ns / 1e9) / camera.clock.rate)
         assert np.abs(position - scene.marker_position(track.true_time)).max() < 2e-3

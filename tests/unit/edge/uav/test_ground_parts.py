@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.uav.base import Box, Telemetry
-from edge.uav.ground.frame_init import frame_from_telemetry
 from edge.uav.ground.image_plane import ImagePlane
+from edge.uav.ground.localisation import frame_from_telemetry
 from edge.uav.ground.photometric import PhotometricGain, TargetGain
 from edge.uav.ground.road_map import CELL, RoadMap
-from edge.uav.prediction import particle_set, path_assignment
+from edge.uav.prediction import occlusion, particle_set
 from edge.uav.prediction.driver_model import DriverModel
 from edge.uav.prediction.particle_set import NO_PATH
 from edge.uav.prediction.paths import RoadPath, road_edges, trace_paths
@@ -343,7 +343,7 @@ def test_predicted_particles_slow_down_for_a_bend_and_not_on_a_straight() -> Non
         particles = particle_set.initialise_prediction(
             particle_set.initialise(np.zeros(2), 0.1, 400, rng), straight_fit(10.0), 0.0, 400, rng
         )
-        particles = path_assignment.assign_paths(particles, [path], 1.0, rng)
+        particles = occlusion.assign_paths(particles, [path], 1.0, rng)
         for _ in range(120):
             particles = particle_set.propagate(particles, 1 / 30, [path], False, rng)
         assert low < np.median(particles.speed) < high
@@ -389,7 +389,7 @@ def test_particles_follow_their_path_and_spread_beyond_its_known_end() -> None:
     spreads = []
     for known in (100.0, 5.0):
         particles = particle_set.initialise(np.zeros(2), 0.1, 400, rng)
-        particles = path_assignment.assign_paths(
+        particles = occlusion.assign_paths(
             particle_set.initialise_prediction(particles, fit, 0.0, 400, rng), [straight_path(known)], 1.0, rng
         )
         for _ in range(60):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge.uav.ground.road_map import CELL, RoadMap
-from edge.uav.prediction import particle_set, path_assignment
+from edge.uav.prediction import occlusion, particle_set
 from edge.uav.prediction.particle_set import ParticleSet
 from edge.uav.prediction.paths import RoadPath, road_edges, trace_paths
 from edge.uav.target.appearance import Candidate
@@ -106,7 +106,7 @@ def test_a_driver_who_does_not_brake_before_a_bend_gets_a_higher_lateral_limit()
     headings = np.arange(0, 120, 1.5) / 20.0
     steps = 1.5 * np.column_stack([np.cos(headings), np.sin(headings)])
     way = RoadPath(np.vstack([np.zeros(2), np.cumsum(steps, axis=0)[:-1]]), headings, 120.0, 1.0)
-    particles = path_assignment.assign_paths(particles_at_speed(rng, 10.0), [way], 1.0, rng)
+    particles = occlusion.assign_paths(particles_at_speed(rng, 10.0), [way], 1.0, rng)
     assert particle_set.raise_lateral_limits(particles, [way]).lateral_limit == pytest.approx(
         np.maximum(particles.lateral_limit, 10.0**2 / 20.0), abs=1.3
     )

@@ -32,12 +32,12 @@ from hub.bundle.problem import (
     TrackObservations,
     Trajectory,
 )
-from hub.bundle.residuals import linearise, residual_norms
+from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.splines import SplineBasis
 from protocols.geometry.types import Floats
 from protocols.session.calibration import AdjustmentStep
-from tests.support.bundles import pixels_of, spline_of
+from tests.support.bundles import linearise, pixels_of, spline_of
 from tests.support.rigs import random_lens, random_path, random_poses
 
 

@@ -9,11 +9,10 @@ import pytest
 
 import hub.calibration.final_adjustment
 from hub.bundle.problem import OFFSET, CameraState, TrackObservations
-from hub.bundle.residuals import linearise
 from hub.calibration.pipeline import calibrate
 from protocols.session.calibration import Calibration
 from tests.support import rigs
-from tests.support.bundles import pixels_of, spline_of
+from tests.support.bundles import linearise, pixels_of, spline_of
 
 SEED = 5120
 JITTERING = ("cam1", "cam2")

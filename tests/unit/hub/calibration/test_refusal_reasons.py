@@ -12,7 +12,8 @@ import pytest
 
 from hub.bundle import initialisation
 from hub.calibration import acceptance as calibrating
-from hub.calibration.pipeline import _no_pair_reason, calibrate
+from hub.calibration.pipeline import calibrate
+from hub.calibration.solvers import _no_pair_reason
 from hub.calibration.triangulation import triangulate
 from hub.sync.pair_solver import _PairSearch, solve_pair
 from hub.sync.settings import PairSettings

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from hub.distributed.partition import cut, partition
+from hub.distributed.sharding import cut, partition
 
 Pairs = dict[tuple[str, str], float]
 

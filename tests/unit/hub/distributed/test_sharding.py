@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hub.distributed.partition import cut
-from hub.distributed.sharding import OverlapMeter, border, split
+from hub.distributed.sharding import OverlapMeter, border, cut, split
 from tests.unit.hub.distributed.test_partition import along_a_street, over_a_town
 
 

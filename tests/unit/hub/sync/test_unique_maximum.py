@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hub.bundle.preprocessing import PreparedSession, prepare
-from hub.calibration import pipeline as solver
+from hub.calibration import solvers as solver
 from hub.calibration.pipeline import calibrate
 from hub.sync import final_refinement, pair_solver
 from hub.sync.acceptance import accept_or_reject, is_unique_maximum

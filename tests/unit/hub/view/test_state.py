@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from hub.view.access_control import AccessControl, is_local
-from hub.view.export import calibration_file
 from hub.view.image_planes import pixel_of
-from hub.view.page import draw_detections
+from hub.view.page import calibration_file, draw_detections
 from hub.view.panels import ago, camera_details, camera_table, overview
 from hub.view.player import CalibrationRecording, LogRecording, Player
 from hub.view.scene_renderer import fit_viewpoint

@@ -9,7 +9,8 @@ from protocols.bus.security.sender_identity import SOURCE_TIMEOUT_S, SenderCheck
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION
-from protocols.validation.codec import Rejected, RejectionReason, decode
+from protocols.validation.codec import decode
+from protocols.validation.rules import Rejected, RejectionReason
 from tests.support.samples import observation
 
 
