@@ -2,7 +2,7 @@
 
     python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique]
         [--first-seed 0] [--ranges 1,2.5,4] [--screens 0] [--covered] [--first-start 0] [--mirrored 0.6]
-        [--light dusk] [--stabilisation] [--json]
+        [--light dusk] [--copies 1] [--stabilisation] [--json]
 
 Rendered oblique flights with truth, and where the data folder has them real ones: whole sequences, and windows that pan
 away from the target for 0.5 to 4 s and come back. No lens, no telemetry.
@@ -219,6 +219,16 @@ def in_light(image: Image, light: str, k: int) -> Image:
     return np.asarray(np.clip(gain * image + level + grain, 0, 255), np.uint8)
 
 
+def grained(sequence: Sequence, copy: int) -> Sequence:
+    """A copy with up to a grey level of noise, 0 = none: what rests on chance comes out otherwise."""
+    if not copy:
+        return sequence
+    rng = np.random.default_rng(copy)
+    grain = (rng.integers(-1, 2, image.shape) for image in sequence.images)
+    images = [np.asarray(np.clip(i + g, 0, 255), np.uint8) for i, g in zip(sequence.images, grain, strict=True)]
+    return replace(sequence, images=images)
+
+
 def table(scores: list[Score]) -> str:
     """One line for each kind and model."""
     titles = ("in view", "overlap", "success", "away", "claimed", "held", "ms/frame")
@@ -251,6 +261,9 @@ def main() -> None:
     parser.add_argument("--mirrored", type=float, help="windows of the mirrored clips, reduced to this share: 0.6")
     parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
     parser.add_argument("--light", default="", help="change the images: dusk, haze, flicker")
+    parser.add_argument(
+        "--copies", type=int, default=1, help="of each sequence, all but one with a grey level of noise"
+    )
     parser.add_argument("--stabilisation", action="store_true", help="only: how well the real videos are stabilised")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
@@ -276,8 +289,10 @@ def main() -> None:
     scores = [
         run(replace(s, images=[in_light(i, light, k) for k, i in enumerate(s.images)]) if light else s, model)
         for source in sources
-        for s in source
-        if not kinds or s.kind in kinds
+        for original in source
+        if not kinds or original.kind in kinds
+        for copy in range(options.copies)
+        for s in (grained(original, copy),)
         for model in models
     ]
     if options.json:
