@@ -115,6 +115,8 @@ def read_follow_input(
     warnings = (*warnings, *more, *steps, *left_out.warnings)
     unused = sorted({message.camera for message in messages} - known.sizes.keys())
     warnings += tuple(f"{name}: not followed in, the calibration refused it" for name in unused if name in known.names)
+    absent = known.sizes.keys() - {message.camera for message in messages} - {known.calibration.reference}
+    warnings += tuple(f"{name}: calibrated, but no frame of it is here" for name in sorted(absent))
     strange = [name for name in unused if name not in known.names]
     if strange:
         what = f"camera {strange[0]!r} is not in the calibration ({', '.join(known.names)})"

@@ -376,6 +376,20 @@ def test_a_given_calibration_that_the_rows_contradict_is_named(
     assert said in text
 
 
+def test_a_camera_that_is_left_out_is_named_in_the_status(session: Session) -> None:
+    stream = messages(session)
+    for message in [one for one in stream if isinstance(one, pb.Observation) and one.camera == "cam0"]:
+        silent = pb.Observation()
+        silent.CopyFrom(message)
+        silent.camera = "cam9"
+        stream.insert(stream.index(message), silent)
+    hub = LiveHub(SETTINGS)
+    feed(hub, stream)
+    assert hub.calibration is not None
+    assert "cam9" not in hub.calibration.cameras
+    assert "not calibrated yet: cam9 (no CameraInfo yet" in status_message(hub, "hub", "b0", 0, [], 0.0).message
+
+
 def test_an_answer_that_the_newest_rows_contradict_is_kept_and_the_hub_says_so(session: Session) -> None:
     hub, stream = LiveHub(SETTINGS), messages(session)
     feed(hub, stream[:-200])

@@ -137,7 +137,7 @@ def test_a_time_that_is_a_clock_step_away_is_left_out_by_name(tmp_path: Path) ->
     lines = [f"{camera},{frame},{frame / 10},100,200,40,160\n" for camera in ("left", "right") for frame in range(5)]
     source = read(tmp_path, BOXES + "".join(lines) + "left,5,1e9,100,200,40,160\n")
     assert [message.camera for message in source.observations].count("left") == 5
-    (warning,) = source.warnings
+    warning, _ = source.warnings
     assert warning == "left: its clock steps by 1000000000 s; 1 of 6 frames on the other side are left out"
 
 
@@ -245,6 +245,12 @@ def test_another_vertical_is_named(up: list[float], tmp_path: Path) -> None:
         InputError, match=r"toml:5: `up` is not the vertical .* who stand along \[.*, 1\.00\] in the wor"
     ):
         read_follow_input(tmp_path, known, "person", tmp_path)
+
+
+def test_a_calibrated_camera_without_frames_is_named(tmp_path: Path) -> None:
+    text = "".join(line for line in boxes_csv().splitlines(keepends=True) if not line.startswith(NAMES[-1]))
+    assert read(tmp_path, boxes_csv()).warnings == ()
+    assert read(tmp_path, text).warnings == (f"{NAMES[-1]}: calibrated, but no frame of it is here",)
 
 
 def test_nobody_is_a_refusal(tmp_path: Path) -> None:
