@@ -298,10 +298,10 @@ def status_message(
         # What is waited for, per camera: the search needs motion that two cameras see at the same time.
         shared = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in hub.progress()[:_NAMED_CAMERAS]]
         message.message += f"; motion shared with another camera: {', '.join(shared)}" if shared else ""
-    elif hub.calibration is not None and len(hub.stream.marker.cameras) > len(hub.calibration.cameras):
-        left = [one for one in hub.progress() if one.camera not in hub.calibration.cameras][:_NAMED_CAMERAS]
-        named = ", ".join(f"{one.camera} ({one.reason})" if one.reason else one.camera for one in left)
-        message.message += f"; not calibrated yet: {named}" if left else ""
+    elif hub.calibration is not None and (left := set(hub.stream.marker.cameras) - hub.calibration.cameras.keys()):
+        reasons = {one.camera: f" ({one.reason})" if one.reason else "" for one in hub.progress()}
+        named = ", ".join(f"{name}{reasons.get(name, '')}" for name in sorted(left)[:_NAMED_CAMERAS])
+        message.message += f"; heard but not calibrated: {named}"
     alarms = [*hub.stream.clocks.alarms.values(), *hub.clock_contradictions()]
     message.message = "; ".join([*alarms, message.message])[:1000]
     _add_parts(message, hub, now)

@@ -35,9 +35,9 @@ _MAX_TIME_S = 9e9
 _MIN_CORNERS, _MIN_OVERLAP = 20, 0.25
 """Boxes, all larger than their distance from the picture's corner, and the share of them that leaves the picture: with
 a width that is the right edge it is that of the people beyond the middle."""
-_MIN_BEYOND, _CENTRED = 10, 0.998
-"""Boxes that end right of the picture, and the share of boxes that are within it if x and y are their centres: boxes
-that their detector did not cut at the picture's border begin left of it as often."""
+_MIN_BEYOND, _CENTRED, _CUT_PX = 10, 0.998, 1.5
+"""Boxes that end right of the picture by more than rounding, and as many that end there if x and y are their centres,
+as cut ones do; the share of boxes that are then within the picture."""
 _MAX_ROUNDED = 1.1
 """Frames with one time, on average: a clock's stamps may repeat now and then."""
 _MAX_EMPTY_PER_FRAME = 20
@@ -114,7 +114,10 @@ def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> Detectio
     count = len(table)
     nothing = np.full((count, 4), np.nan)
     kind = table.text("kind") if "kind" in table.columns else [""] * count
-    table.refuse(np.array([one not in KINDS for one in kind]), lambda row: f"kind {kind[row][:40]!r} is none")
+    remedy = f"use one of {', '.join(KINDS[1:])}, or leave it empty"
+    table.refuse(
+        np.array([one not in KINDS for one in kind]), lambda row: f"kind {kind[row][:40]!r} is not known", remedy
+    )
     return DetectionRows(
         camera=table.text("camera"),
         label=[""] * count,
@@ -138,14 +141,21 @@ def _refuse_other_boxes(table: CsvTable, box: Floats, limit: Floats) -> None:
     groups = {"": np.ones(len(box), dtype=np.bool_)} | {f"{name}: ": names == name for name in dict.fromkeys(names)}
     for name, mine in groups.items():
         corner, size = box[mine, :2], box[mine, 2:]
-        beyond = corner + size > limit[mine]
-        centred = ((corner >= 0.5 * size - 1.5) & (corner + 0.5 * size <= limit[mine] + 1.5)).all(axis=1)
+        beyond = corner + size > limit[mine] + _CUT_PX
+        past = corner + 0.5 * size - limit[mine]
+        centred = ((corner >= 0.5 * size - _CUT_PX) & (past <= _CUT_PX)).all(axis=1)
+        cut = int((np.abs(past[:, 0]) <= _CUT_PX).sum())
         if (box[mine] <= 1.0).all():
             what = "all boxes are within 0 to 1: fractions of the picture"
             remedy = "multiply x and width by the picture's width, y and height by its height"
-        elif len(size) >= _MIN_CORNERS and (size > corner).all() and beyond.any(axis=1).mean() > _MIN_OVERLAP:
+        elif (
+            not name
+            and len(size) >= _MIN_CORNERS
+            and (size > corner).all()
+            and beyond.any(axis=1).mean() > _MIN_OVERLAP
+        ):
             what, remedy = "width and height look like the right and the lower edge of the boxes", "subtract x and y"
-        elif beyond[:, 0].sum() >= _MIN_BEYOND and centred.mean() >= _CENTRED:
+        elif min(beyond[:, 0].sum(), cut) >= _MIN_BEYOND and centred.mean() >= _CENTRED:
             what, remedy = "x and y look like the middle of the boxes", "subtract half the width and half the height"
         else:
             continue
@@ -160,7 +170,8 @@ def _refuse_rounded_times(table: CsvTable) -> None:
         pairs = np.unique(np.column_stack([times[mine], frames[mine]]), axis=0)
         stamps = np.unique(pairs[:, 0])
         if len(pairs) < len(mine) and len(pairs) > _MAX_ROUNDED * len(stamps):
-            same = (times == times[mine[0]]) & (names == name)
+            shared = stamps[np.bincount(np.searchsorted(stamps, pairs[:, 0])) > 1]
+            same = (times == shared[0]) & (names == name)
             what = f"{len(pairs)} frames of {name} have {len(stamps)} different times: they are rounded"
             raise InputError(
                 what,

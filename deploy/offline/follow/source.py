@@ -110,12 +110,12 @@ def read_follow_input(
             videos = {video.camera: video.path for video in list_videos(session)[0]}
         if session.is_dir() and (session / RIG_FILE).exists():
             shared |= read_rig(session / RIG_FILE).shared_clock
-    messages, steps = _without_clock_steps(messages)
+    messages, steps = _without_clock_steps(messages, file or session)
     found, left_out = followed_detections(messages, kind, known.sizes)
     warnings = (*warnings, *more, *steps, *left_out.warnings)
     unused = sorted({message.camera for message in messages} - known.sizes.keys())
     warnings += tuple(f"{name}: not followed in, the calibration refused it" for name in unused if name in known.names)
-    absent = known.sizes.keys() - {message.camera for message in messages} - {known.calibration.reference}
+    absent = known.sizes.keys() - {message.camera for message in messages}
     warnings += tuple(f"{name}: calibrated, but no frame of it is here" for name in sorted(absent))
     strange = [name for name in unused if name not in known.names]
     if strange:
@@ -163,28 +163,30 @@ def check_log(file: Path, calibration: Path) -> tuple[str, ...]:
     """Warnings about the people in a log as `follow` gives them. Raises InputError where they contradict the units,
     pictures, poses or vertical of a calibration.toml."""
     known = read_given_calibration(calibration)
-    found, _ = followed_detections(_without_clock_steps(_read_log(file)[0])[0], "person", known.sizes)
+    found, _ = followed_detections(_without_clock_steps(_read_log(file)[0], file)[0], "person", known.sizes)
     return check_units(found, known, "person", file) if any(message.detections for message in found) else ()
 
 
-def _without_clock_steps(messages: list[pb.Observation]) -> tuple[list[pb.Observation], tuple[str, ...]]:
+def _without_clock_steps(messages: list[pb.Observation], file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
     """The messages on the longer side of a step of their camera's clock, as `calibrate` takes it; and warnings.
 
-    Raises InputError where frames are too far apart.
+    Raises InputError where the frames of all cameras are too far apart.
     """
     kept: dict[str, tuple[int, int]] = {}
+    intervals: list[float] = []
     warnings = []
     for camera in dict.fromkeys(message.camera for message in messages):
         times = np.sort([message.device_time_ns for message in messages if message.camera == camera])
         gaps = np.diff(times / NANOSECONDS)
-        if len(gaps) and (interval := float(np.median(gaps))) > _MAX_INTERVAL_S:
-            what = f"{camera}: its frames are {interval:.4g} s apart, over which nobody is followed"
-            raise InputError(what, remedy="give times in seconds, not in milliseconds or another unit")
+        intervals += [float(np.median(gaps))] if len(gaps) else []
         part = max(np.split(times, np.flatnonzero(gaps > MAX_PAUSE_S) + 1), key=len)
         kept[camera] = int(part[0]), int(part[-1])
         if len(part) < len(times):
             left = f"{len(times) - len(part)} of {len(times)} frames on the other side are left out"
             warnings.append(f"{camera}: its clock steps by {gaps.max():.0f} s; {left}")
+    if min(intervals, default=0.0) > _MAX_INTERVAL_S:
+        what = f"frames are {min(intervals):.4g} s apart, over which nobody is followed"
+        raise InputError(what, file=file, remedy="give times in seconds, not in milliseconds or another unit")
     left_in = [one for one in messages if kept[one.camera][0] <= one.device_time_ns <= kept[one.camera][1]]
     return left_in, tuple(warnings)
 

@@ -117,7 +117,7 @@ def _refuse_wide(messages: Sequence[pb.Observation], known: GivenCalibration, se
     standing = {
         name
         for name, camera in known.calibration.cameras.items()
-        if known.up is not None and -(camera.pose.rotation.T @ known.up)[1] > _UPRIGHT
+        if known.up is not None and -(camera.pose.rotation @ known.up)[1] > _UPRIGHT
     }
     boxes = [d.box for message in messages if message.camera in standing for d in message.detections if d.box]
     if len(boxes) >= _MIN_LOOKED_AT and np.median([box[2] / box[3] for box in boxes]) > _WIDE:

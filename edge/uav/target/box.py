@@ -10,6 +10,7 @@ from protocols.geometry.types import Image
 
 _MIN_BOX_PX = 4.0  # side
 _MIN_INSIDE_SHARE = 0.3  # share of the box
+_BEYOND = 1.1  # of the picture's side: a box drawn by hand may end somewhat outside
 
 
 def check_target_box(image: Image, size: tuple[int, int], target: Box) -> None:
@@ -29,7 +30,7 @@ def check_target_box(image: Image, size: tuple[int, int], target: Box) -> None:
             f"target {text} is outside the image of {width}x{height}", remedy="give x,y,w,h of a car in the image"
         )
     inside = target.x < target.width <= width and target.y < target.height <= height
-    if inside and (target.x + target.width > width or target.y + target.height > height):
+    if inside and (target.x + target.width > _BEYOND * width or target.y + target.height > _BEYOND * height):
         what = f"target {text} reaches beyond the image, and looks like its left, top, right and lower edge"
         raise InputError(what, remedy="give x,y,w,h with width and height")
     if target.width * target.height > 0.5 * width * height:

@@ -23,7 +23,10 @@ _MAX_GAP_S = 1.5  # between positions that are interpolated: of receivers at 1 H
 _MIN_WINDOWS = 5  # by chance a coherence of 0.9 is one of 700 among so few
 _MIN_WAY = 0.015  # heights a window (rms), 0.9 m/s at 60 m: ten times the images' error in a simulated hover
 _MIN_COHERENCE = 0.9  # of a simulated flight it is 0.995, in wind, with clocks 0.25 s apart
-_UNLIKE = 0.75  # with clocks 0.5 s apart it is at least 0.79, in six simulated flights; 3 s apart, 0.2 to 0.6 in four
+_UNLIKE = (
+    0.65  # with clocks 3 s apart 0.2 to 0.6 in four simulated flights; 0.67 of positions 3 s apart in turns of 6 s
+)
+_LONG_M = 2.0  # a window: a receiver's noise of 0.5 m changes the coherence of such ways by 0.1
 _MAX_TURN = 0.25 * math.pi  # nearer to another quarter turn than to none; no compass is so wrong
 _MAX_LOG_RATIO = 0.12  # of both ways: of simulated flights with clocks 0.25 s apart it is up to 0.1
 _STANDS_STILL = 0.01  # ratio of positions in degrees, or that never change; no ground is so much nearer
@@ -69,7 +72,7 @@ class GroundMotion:
     @property
     def differs_in_shape(self) -> bool:
         """Whether both are long, and ways of different flights or times."""
-        return self.coherence < _UNLIKE and self.reported >= _MIN_WAY * self.height
+        return self.coherence < _UNLIKE and min(self.seen, self.reported) >= max(_MIN_WAY * self.height, _LONG_M)
 
     @property
     def contradiction(self) -> str:

@@ -387,7 +387,7 @@ def test_a_camera_that_is_left_out_is_named_in_the_status(session: Session) -> N
     feed(hub, stream)
     assert hub.calibration is not None
     assert "cam9" not in hub.calibration.cameras
-    assert "not calibrated yet: cam9 (no CameraInfo yet" in status_message(hub, "hub", "b0", 0, [], 0.0).message
+    assert "heard but not calibrated: cam9 (no CameraInfo yet" in status_message(hub, "hub", "b0", 0, [], 0.0).message
 
 
 def test_an_answer_that_the_newest_rows_contradict_is_kept_and_the_hub_says_so(session: Session) -> None:

@@ -294,9 +294,11 @@ def test_boxes_of_other_pictures_or_of_half_bodies_are_named(
         read_follow_input(tmp_path, known if up else replace(known, up=None), "person", tmp_path)
 
 
-def test_swapped_widths_and_heights_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("camera", NAMES)
+def test_swapped_widths_and_heights_are_named(camera: str, tmp_path: Path) -> None:
+    """Whichever way the camera looks."""
     header, *lines = boxes_csv(3.0).splitlines()
-    swapped = [",".join([*(c := line.split(","))[:5], c[6], c[5]]) for line in lines]
+    swapped = [",".join([*(c := line.split(","))[:5], c[6], c[5]]) for line in lines if line.startswith(camera)]
     assert "most boxes are wider than high" in str(bad(tmp_path, "\n".join([header, *swapped])))
 
 
@@ -313,11 +315,32 @@ def test_one_cameras_fractions_are_named(tmp_path: Path) -> None:
 
 def test_middles_of_boxes_are_named_where_people_walk_out_on_the_right(tmp_path: Path) -> None:
     """Of a detector that cuts boxes at the picture's border; x and y of its top left are nowhere beyond it."""
-    boxes = [(x, 300.0, 40.0, 160.0) for x in (*np.linspace(0.0, 900.0, 48), *np.linspace(902.0, 920.0, 12))]
+    boxes = [(x, 300.0, min(40.0, 960.0 - x), 160.0) for x in (*np.linspace(0, 900, 48), *np.linspace(922, 950, 12))]
     corners = [f"left,{i},{i},{x},{y},{w},{h}" for i, (x, y, w, h) in enumerate(boxes)]
     middles = [f"left,{i},{i},{x + w / 2},{y + h / 2},{w},{h}" for i, (x, y, w, h) in enumerate(boxes)]
     assert len(read_objects(rows(tmp_path, "\n".join([BOXES.strip(), *corners])), SIZES)) == 60
     assert "x and y look like the middle" in str(bad(tmp_path, "\n".join([BOXES.strip(), *middles])))
+
+
+@pytest.mark.parametrize(
+    "boxes",
+    [
+        [(921.0, 300.0, 40.0, 160.0)] * 40 + [(300.0, 300.0, 40.0, 160.0)] * 40,
+        [(450.0 + 3.0 * i, 300.0, 60.0, 160.0) for i in range(160)],
+        [(200.0, 50.0, 500.0, 700.0)] * 40,
+    ],
+    ids=["numbered from 1", "not cut at the border", "one who stands close"],
+)
+def test_good_boxes_at_the_border_are_taken(boxes: list[tuple[float, ...]], tmp_path: Path) -> None:
+    lines = [f"left,{i},{i / 10},{x},{y},{w},{h}" for i, (x, y, w, h) in enumerate(boxes)]
+    lines += [f"right,{i},{i / 10},400,300,40,160" for i in range(40)]
+    assert len(read_objects(rows(tmp_path, "\n".join([BOXES.strip(), *lines])), SIZES)) == len(lines)
+
+
+def test_a_camera_that_seldom_sees_anybody_is_followed_in(tmp_path: Path) -> None:
+    lines = [f"left,{i},{i / 10},{400 + 5 * i},300,60,160" for i in range(40)]
+    lines += ["right,10,1.0,400,300,60,160", "right,220,22.0,400,300,60,160"]
+    assert read(tmp_path, "\n".join([BOXES.strip(), *lines])).observations
 
 
 def test_times_that_several_frames_share_are_named(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from edge.uav.correlation.filter import CorrelationFilter, windowed
 from edge.uav.correlation.oriented_box import OrientedBox, crop
 from edge.uav.correlation.scale import BoxFlow
 from edge.uav.image_motion.scene_motion import STILL, SceneMotion
+from edge.uav.target.box import check_target_box
 from edge.uav.tracker_factory import make_tracker
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
 from protocols.geometry.camera import Intrinsics
@@ -301,3 +302,8 @@ def test_a_turn_must_show_in_the_similarity(scene: Image, turned: float, kept: b
     upright, along = tracker._memory.first_scores(later, [tracker.box, tracker.box.turned(angle)])
     assert along > upright
     assert (tracker._anchored(later, tracker.box.turned(angle)).angle == pytest.approx(angle)) == kept
+
+
+@pytest.mark.parametrize("box", [(40, 330, 60, 395), (200, 300, 230, 421), (0, 355, 30, 366)])
+def test_a_box_drawn_somewhat_beyond_the_border_is_taken(box: tuple[int, ...]) -> None:
+    check_target_box(np.zeros((720, 1280, 3), np.uint8), (1280, 720), Box(*map(float, box)))
