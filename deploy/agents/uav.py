@@ -107,7 +107,6 @@ def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable
     import cv2
 
     from deploy.agents.systemd_notify import HeartbeatDevice
-    from deploy.agents.uav import OperatorVideo, serve_video
     from edge.agents.uav import UavAgent
     from edge.agents.uav_settings import UavSettings
 

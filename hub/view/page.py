@@ -6,23 +6,21 @@ from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from hub.live.messages import calibration_from_message
 from hub.view.lag_chart import lag_charts
 from hub.view.panels import camera_details, camera_table, overview, picture_tiles, recording_html
 from hub.view.scene_renderer import DisplayOptions, decode_rgb
 from hub.view.state import CameraView, ViewState
 from hub.view.uav_overlay import draw_uav, pad_to_aspect, uav_panel_html
 from hub.view.uav_state import UavView
+from protocols.session.builder import rig_camera_from_info
+from protocols.session.calibration import calibration_text
+from protocols.session.rig import Rig
 
 if TYPE_CHECKING:
     import viser
 
     from hub.view.player import Player
-
-
-from hub.live.messages import calibration_from_message
-from protocols.session.builder import rig_camera_from_info
-from protocols.session.calibration import calibration_text
-from protocols.session.rig import Rig
 
 
 def calibration_file(state: ViewState) -> str:

@@ -62,6 +62,19 @@ def test_calibrate_does_not_load_what_scipy_imports_in_vain() -> None:
     assert one == "1"  # what is used is loaded then
 
 
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [
+        ("edge.devices.playback.playback_clock", "edge.devices.base"),
+        ("edge.devices.simulated.aircraft", "edge.uav.world.rendering"),
+    ],
+)
+def test_a_clock_loads_no_device_and_an_aircraft_no_renderer(module: str, heavy: str) -> None:
+    code = f"import sys, {module}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert heavy not in done.stdout.split()
+
+
 @pytest.mark.parametrize("package", ["protocols", "edge", "hub", "deploy"])
 def test_a_package_offers_its_names_without_loading_what_is_behind_them(package: str) -> None:
     code = f"import sys, {package}; print(dir({package})); print(*sys.modules)"

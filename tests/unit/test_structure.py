@@ -76,6 +76,17 @@ def _imports(name: str, file: Path, modules: set[str]) -> set[str]:
     return (found & modules) - {name}
 
 
+def test_a_module_imports_from_others_and_above_what_it_imports_for_types() -> None:
+    wrong = []
+    for name in _tracked(*(f"{package}/*.py" for package in PACKAGES)):
+        tree, own = ast.parse((ROOT / name).read_text(encoding="utf-8")), name.removesuffix(".py").replace("/", ".")
+        wrong += [name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module == own]
+        kinds = [ast.unparse(node).partition("\n")[0] for node in tree.body]
+        below = kinds[kinds.index("if TYPE_CHECKING:") :] if "if TYPE_CHECKING:" in kinds else []
+        wrong += [name for kind in below if kind.startswith(("import ", "from "))]
+    assert not wrong
+
+
 def import_graph() -> dict[str, set[str]]:
     """Who imports whom among the modules of the four packages; lazy and type-only imports count."""
     files = {}

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
 from edge.devices.base import DeviceInfo, Frame, check_size
 from edge.devices.live.opencv_capture import OpenCvCamera
-from edge.devices.playback.playback_clock import Playback, PlaybackClock
+from edge.devices.playback.base import Playback
+from edge.devices.playback.playback_clock import PlaybackClock
 from edge.devices.playback.video_reader import VideoReader
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 
@@ -40,8 +41,9 @@ def open_video(
 class VideoPlayback(Playback):
     """Plays a video file or a folder of images as a device.
 
-    Times are those of ``VideoReader``; an image of a folder that it would leave out raises InputError. The other
-    arguments are those of ``open_video``.
+    Times are those of ``VideoReader``, from 0 for the first frame; an image of a folder that it would leave out raises
+    InputError, as does a looped file of which a later round can read no frame. The other arguments are those of
+    ``open_video``.
     """
 
     def __init__(
@@ -56,11 +58,12 @@ class VideoPlayback(Playback):
         super().__init__(playback_clock)
         self._path, self._fps, self._loop, self._intrinsics = path, fps, loop, intrinsics
         self._reader: VideoReader | None = None
+        self._repaired = 0  # in the rounds of a loop before this one
 
     @property
     def repaired(self) -> int:
         """Frames so far whose time stamp could not be used."""
-        return 0 if self._reader is None else self._reader.repaired
+        return self._repaired + (0 if self._reader is None else self._reader.repaired)
 
     def open(self) -> None:
         """Raises InputError if no frame can be read."""
@@ -73,11 +76,18 @@ class VideoPlayback(Playback):
         self._info = DeviceInfo(width, height, fps, driver, "stream", self._intrinsics, unknown=("exposure",))
 
     def _read(self, reader: VideoReader) -> Iterator[Frame]:
-        time_s, offset_s = -math.inf, 0.0  # of the last frame; added by loops
+        begin_s = 0.0  # of this round
         numbers = itertools.count()
-        while math.isfinite(offset_s):
-            begin_s, time_s = offset_s, -math.inf
+        while True:
+            first_s = time_s = None
             for one in reader:
-                time_s = begin_s + one.time
+                # Containers may begin at any time: transport streams count on from the camera's start.
+                first_s = one.time if first_s is None else first_s
+                time_s = begin_s + one.time - first_s
                 yield Frame(one.image(), round(time_s * NANOSECONDS), next(numbers))
-            offset_s = time_s + 1.0 / reader.info.fps if self._loop else math.inf
+            if time_s is None:
+                raise InputError("no frame can be read from this video", file=self._path, remedy="replace it")
+            if not self._loop:
+                return
+            begin_s = time_s + 1.0 / reader.info.fps
+            self._repaired += reader.repaired

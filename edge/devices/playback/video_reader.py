@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -88,8 +89,9 @@ class VideoReader:
             raise InputError("the video states no frame rate", file=path, remedy="give its fps")
 
     def __iter__(self) -> Iterator[VideoFrame]:
-        """All frames from the first one on, in order of time."""
+        """All frames from the first one on, in order of time. Raises InputError if the file cannot be read any more."""
         self.corrupt = self.repaired = self.resized = 0
+        check_recording(self.path)
         return self._read_folder() if self.path.is_dir() else self._read_file()
 
     @property
@@ -128,27 +130,31 @@ class VideoReader:
             yield VideoFrame(frame, index / self.info.fps, partial(np.asarray, image))
             frame += 1
 
-    def _file_info(self) -> VideoInfo:
+    @contextmanager
+    def _opened(self) -> Iterator[InputContainer]:
+        """The file in PyAV; its errors become InputError."""
         import av
 
         try:
             with av.open(str(self.path)) as container:
                 if not container.streams.video:
                     raise InputError("there is no video in this file", file=self.path, remedy=_CONVERT)
-                stream = container.streams.video[0]
-                first = next(self._decoded(container), None)
-                if first is None:
-                    raise InputError("no frame can be read from this file", file=self.path, remedy=_CONVERT)
-                rate = self._given_fps or float(stream.average_rate or stream.guessed_rate or 0.0)
-                # Some containers have no frame count: use the duration.
-                seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
-                count = stream.frames or round(seconds * rate)
-                end = _stated_end(container)
-                size = upright_size(first)
+                yield container
         except av.error.FFmpegError as error:
             what = f"no frame can be read from this file: {error.strerror}"
             raise InputError(what, file=self.path, remedy=_CONVERT) from None
-        return VideoInfo(size, rate, count, end)
+
+    def _file_info(self) -> VideoInfo:
+        with self._opened() as container:
+            stream = container.streams.video[0]
+            first = next(self._decoded(container), None)
+            if first is None:
+                raise InputError("no frame can be read from this file", file=self.path, remedy=_CONVERT)
+            rate = self._given_fps or float(stream.average_rate or stream.guessed_rate or 0.0)
+            # Some containers have no frame count: use the duration.
+            seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
+            count = stream.frames or round(seconds * rate)
+            return VideoInfo(upright_size(first), rate, count, _stated_end(container))
 
     def _read_file(self) -> Iterator[VideoFrame]:
         last, frame = -math.inf, 0
@@ -169,9 +175,7 @@ class VideoReader:
             self.cut = f"it ends at {last:.1f} s, {says}: the file seems to be cut off"
 
     def _pyav_frames(self) -> Iterator[_Decoded]:
-        import av
-
-        with av.open(str(self.path)) as container:
+        with self._opened() as container:
             for decoded in self._decoded(container):
                 if decoded.is_corrupt:
                     self.corrupt += 1

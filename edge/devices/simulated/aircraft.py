@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,10 +18,12 @@ from edge.devices.base import DeviceInfo, Frame
 from edge.devices.playback.playback_clock import PlaybackClock, wait_until
 from edge.mavlink.roles.autopilot import SensorReadings
 from edge.uav.world.flight import Flight
-from edge.uav.world.flight_world import FlightWorld
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry import so3
 from protocols.geometry.types import Floats, Image
+
+if TYPE_CHECKING:
+    from edge.uav.world.flight_world import FlightWorld
 
 _TRANSFER_S = 0.004  # from mid-exposure to the host
 

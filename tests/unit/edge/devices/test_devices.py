@@ -21,6 +21,8 @@ from edge.scenes.common.base import Renderer
 from edge.scenes.marker.scene import MarkerScene
 from protocols.core.errors import InputError
 from tests.support.clocks import AsFastAsPossible
+from tests.support.videos import numbered_image
+from tests.support.videos import write_video as write_stamped_video
 
 
 class BlankRenderer(Renderer):
@@ -196,6 +198,11 @@ def test_times_that_do_not_increase_are_repaired_by_the_nominal_rate(
     times = [frame.device_time_ns / 1e9 for frame in read_all(device)]
     assert times == pytest.approx([0.0, 0.04, 0.08, 0.12, 0.16, 0.2])
     assert device.repaired == 3
+    looped = VideoPlayback(tmp_path / "odd.mp4", loop=True)
+    looped.open()
+    for _ in range(13):
+        assert looped.read(0.0) is not None
+    assert looped.repaired == 6  # in two rounds
 
 
 def test_a_given_rate_overrides_the_files(tmp_path: Path) -> None:
@@ -214,6 +221,41 @@ def test_a_loop_runs_on_in_time(tmp_path: Path) -> None:
     times = [frame.device_time_ns / 1e9 for frame in frames if frame]
     assert times == pytest.approx([k / 25 for k in range(8)])
     assert not device.ended
+
+
+@pytest.mark.parametrize("name", ["a.ts", "a.mts"])
+def test_a_loop_begins_at_0_whatever_the_first_time_stamp_is(tmp_path: Path, name: str) -> None:
+    write_stamped_video(tmp_path / name, [numbered_image(i) for i in range(6)], 3600.0 + np.arange(6) / 25)
+    device = VideoPlayback(tmp_path / name, loop=True)
+    device.open()
+    frames = [device.read(0.1) for _ in range(15)]
+    assert [frame.device_time_ns / 1e9 for frame in frames if frame] == pytest.approx(np.arange(15) / 25, abs=1e-3)
+
+
+@pytest.mark.parametrize("pyav", [True, False])
+def test_a_looped_file_that_is_removed_or_replaced_is_refused_with_a_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pyav: bool
+) -> None:
+    monkeypatch.setattr(video_reader, "has_pyav", lambda: pyav)
+    file = tmp_path / "clip.avi"
+    write_video(file, "MJPG", 25.0, 3)
+    original = file.read_bytes()
+    write_stamped_video(tmp_path / "other.avi", [numbered_image(1)], [0.0])
+    for content, says in (
+        (None, "this video does not exist; check the path"),
+        (b"no video", r"no frame can be read from this .*; .+"),
+        ((tmp_path / "other.avi").read_bytes(), "no frame can be read from this video; .+"),  # of another size
+    ):
+        file.write_bytes(original)
+        device = VideoPlayback(file, loop=True)
+        device.open()
+        for _ in range(3):
+            device.read(0.1)
+        file.unlink()
+        if content is not None:
+            file.write_bytes(content)
+        with pytest.raises(InputError, match=rf"clip\.avi: {says}"):
+            read_all(device)
 
 
 def test_playing_in_real_time_waits_for_each_frame(tmp_path: Path) -> None:
