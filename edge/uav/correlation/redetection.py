@@ -20,7 +20,7 @@ from protocols.geometry.types import Floats, Image
 _MARGIN = 1.0  # log odds by which a place must exceed the next best one, and the one under test
 _MANOEUVRE = 3.0  # acceleration of what brakes, turns or sets off, in lengths a second squared; a car that starts
 _ANYWHERE_RATE = 0.01  # at which a target is not near its prediction any more [1/s]
-_PROPOSED = 1.0  # log prior of a place that another tracker has found
+_PROPOSED, _MOST_PROPOSED = 2.5, 1.0  # log likelihood ratio of another tracker's place; its log prior, at most
 _PROMISING = 0.0  # log odds of a place under test above which others are searched about the prediction only
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
 _MOST_TESTED, _RIVAL_MARGIN = 2, 2.0  # places that are tested at once; log odds within which one is a rival
@@ -74,7 +74,7 @@ class Redetection:
 
     def propose(self, box: OrientedBox, expected: Prediction) -> None:
         """Test a place that another tracker has found."""
-        prior = float(np.logaddexp(self._log_prior(box.centre, expected), _PROPOSED))
+        prior = min(self._log_prior(box.centre, expected) + _PROPOSED, _MOST_PROPOSED)
         same = [c for c in self._tested if c.covers(box)]
         for candidate in same:
             candidate.prior = max(candidate.prior, prior)

@@ -216,6 +216,18 @@ def test_what_moves_is_evidence_while_it_looks_like_the_target(scene: Image, mon
     assert stands - unknown < -1.5
 
 
+def test_a_place_that_another_tracker_found_is_as_probable_as_it_is_near(scene: Image) -> None:
+    """At even odds wherever it was, a pier 250 px off became a boat that was out of the picture."""
+    image, box = painted(scene, np.array([120.0, 120.0])), OrientedBox(120.0, 120.0, *map(float, TARGET))
+    search = Redetection(
+        SIZE, TemplateMemory(), lambda image, box: (box, Response(0.0, 0.0, 0.0, 1.0)), ColourModel(image, box)
+    )
+    for x in (122.0, 300.0):
+        search.propose(box.at(np.array([x, 120.0])), prediction(120.0))
+    near, far = (candidate.prior for candidate in search._tested)
+    assert near > 0.0 > far
+
+
 def test_a_place_that_moves_under_test_looks_like_others_that_move(scene: Image) -> None:
     place = np.array([120.0, 120.0])
     image, box = painted(scene, place), OrientedBox(*place, *map(float, TARGET))
