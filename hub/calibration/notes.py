@@ -135,7 +135,7 @@ def clock_step_warnings(cameras: dict[str, CameraCalibration]) -> tuple[str, ...
 
 
 def large_residuals(names: list[str], state: AdjustmentState) -> tuple[str, ...]:
-    """One sentence for each camera whose residuals are no noise, though no test told what they are.
+    """One sentence for each camera whose residuals are no noise, though no test shows what they are.
 
     They are larger than the others' as angles too: what blurs an image has more pixels in a larger one.
     """
