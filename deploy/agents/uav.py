@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from edge.uav.world.flight_world import FlightWorld
     from protocols.geometry.types import Image
 
+_HOVER_HEIGHT_M = 62.0  # m above the ground
+_GIMBAL_PITCH_RAD = math.radians(-62.0)
+
 
 class OperatorVideo:
     """The latest frame and estimate, rendered and encoded only on request. notify: called for every new frame."""
@@ -86,10 +89,6 @@ def serve_video(
     shown_host = f"[{host}]" if ":" in host else host
     uri = out.uri or f"{scheme}://{shown_host}:{port}{path}"
     return VideoStream("rtsp" if uri.startswith("rtsp://") else "mjpeg", uri)
-
-
-_HOVER_HEIGHT_M = 62.0  # m above the ground
-_GIMBAL_PITCH_RAD = math.radians(-62.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

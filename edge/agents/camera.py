@@ -32,6 +32,13 @@ from protocols.validation.rules import SCHEMA_VERSION
 
 _MAX_AGE_S = 0.5  # a prediction farther away in time is not used for a frame
 _VELOCITY_STD = 60.0  # px/s, std of a target's deviation from the predicted image velocity
+ROLE = "camera"
+_READ_TIMEOUT_S = 0.1  # upper bound of the stop latency while no frame comes
+_INFO_PERIOD_S = 2.0  # for late joiners over a lossy link
+_STATUS_PERIOD_S = 1.0  # as all agents: health counts 5 s without a status as dead
+# Drivers of real cameras: such a source has no end of its own, so an end means that the camera was lost.
+_LIVE_DRIVERS = frozenset({"video", "usb", "picamera2", "rtsp", "oak"})
+_QUEUE_CAPACITY = 1024  # messages: half a minute of frames while the bus is blocked
 
 
 class PredictionSubscriber:
@@ -75,15 +82,6 @@ def _prediction(target: pb.PredictedTarget, ahead: float) -> Prediction:
         size=target.size,
         colour=(colour.red, colour.green, colour.blue) if target.HasField("colour") else None,
     )
-
-
-ROLE = "camera"
-_READ_TIMEOUT_S = 0.1  # upper bound of the stop latency while no frame comes
-_INFO_PERIOD_S = 2.0  # for late joiners over a lossy link
-_STATUS_PERIOD_S = 1.0  # as all agents: health counts 5 s without a status as dead
-# Drivers of real cameras: such a source has no end of its own, so an end means that the camera was lost.
-_LIVE_DRIVERS = frozenset({"video", "usb", "picamera2", "rtsp", "oak"})
-_QUEUE_CAPACITY = 1024  # messages: half a minute of frames while the bus is blocked
 
 
 class CameraAgent:

@@ -15,21 +15,6 @@ from dataclasses import dataclass
 
 from protocols.core.errors import InputError
 
-
-@dataclass(frozen=True, slots=True)
-class LensModel:
-    """One camera or one of its modes.
-
-    field_of_view_deg: degrees. diagonal: whether it is stated for the diagonal. std: relative, of the focal length.
-    """
-
-    name: str
-    field_of_view_deg: float
-    diagonal: bool = False
-    fisheye: bool = False
-    std: float = 0.08
-
-
 # name, field of view, diagonal, fisheye, std
 _TABLE: tuple[tuple[str, float, bool, bool, float], ...] = (
     # Wide: one unit of a HERO3 was measured at 114 (equidistant) to 121 degrees by its owner, R. Cunniff, in 2012.
@@ -75,9 +60,25 @@ _TABLE: tuple[tuple[str, float, bool, bool, float], ...] = (
     ("raspberry-pi-camera-3", 66.0, False, False, 0.06),
     ("raspberry-pi-camera-3-wide", 102.0, False, False, 0.08),
 )
-LENS_MODELS = {row[0]: LensModel(*row) for row in _TABLE}
 FIELD_OF_VIEW_STD = 0.1
 """Relative std of a focal length from a field of view given by the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensModel:
+    """One camera or one of its modes.
+
+    field_of_view_deg: degrees. diagonal: whether it is stated for the diagonal. std: relative, of the focal length.
+    """
+
+    name: str
+    field_of_view_deg: float
+    diagonal: bool = False
+    fisheye: bool = False
+    std: float = 0.08
+
+
+LENS_MODELS = {row[0]: LensModel(*row) for row in _TABLE}
 
 
 def find_lens_model(name: str) -> LensModel:

@@ -35,6 +35,13 @@ _CAMERA_REGULARISATION = 1e-12  # of the cameras' normal matrix: parameters that
 
 BAND = 3 * SUPPORT
 """Upper bands stored: four control points of three coordinates."""
+_SUPPORT = np.arange(SUPPORT, dtype=np.int32)
+_PAIRS = tuple((a, b) for a in range(SUPPORT) for b in range(a, SUPPORT))
+_UPPER = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # index of (i, j) in the stored upper triangle
+_PAIR_FIRST, _PAIR_SECOND = (np.array(one) for one in zip(*_PAIRS, strict=True))
+_PAIR_COLUMNS = np.arange(len(_PAIRS), dtype=np.int32)
+_ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
+THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,14 +148,6 @@ def add_rows(
     return [(low, block.reshape(-1, others)) for low, block in parts], gram
 
 
-_SUPPORT = np.arange(SUPPORT, dtype=np.int32)
-_PAIRS = tuple((a, b) for a in range(SUPPORT) for b in range(a, SUPPORT))
-_UPPER = ((0, 1, 2), (1, 3, 4), (2, 4, 5))  # index of (i, j) in the stored upper triangle
-_PAIR_FIRST, _PAIR_SECOND = (np.array(one) for one in zip(*_PAIRS, strict=True))
-_PAIR_COLUMNS = np.arange(len(_PAIRS), dtype=np.int32)
-_ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
-
-
 def border_block(index: Ints, weights: Floats, values: Floats, size: int) -> Floats:
     """Sum over rows of w ⊗ value: (size, p) of values (3, p, n); size: three times the control points."""
     _, width, rows = values.shape
@@ -195,9 +194,6 @@ def third_difference_gradient(basis: SplineBasis | PointBasis, gradients: Floats
     for k, coefficient in enumerate(THIRD_DIFFERENCE):
         out[index + k] += coefficient * gradients
     return out.ravel()
-
-
-THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 
 
 def third_differences(basis: SplineBasis | PointBasis, control: Floats) -> Floats:

@@ -41,6 +41,8 @@ from protocols.session.calibration import FixedCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
+_LENS_ITERATIONS = 3  # a bound: it stops where no lens changes
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
@@ -59,9 +61,6 @@ class Solution:
     """Poses that were given and are kept; their world is then the published one."""
     acceptance: Mapping[str, Sequence[AcceptanceTest]] = field(default_factory=dict)
     """The acceptance tests by camera, those of refused cameras among them."""
-
-
-_LENS_ITERATIONS = 3  # a bound: it stops where no lens changes
 
 
 def paper_pairs(prepared: PreparedSession, observations: Observations, report: Progress) -> list[PairSolution]:

@@ -20,6 +20,11 @@ _IMBALANCE = 0.05
 """By how much a part may be larger than its share, for a smaller cut."""
 _EXACT_SIZE = 64
 """Vertices up to which the eigenvector comes from a dense matrix."""
+_WINDOW_S = 30.0  # of film that overlaps come from: what a calibration needs at least
+_MAX_EXCESS = 0.25
+"""By how much a group may be larger than its share before all are split anew; a split itself leaves a twentieth."""
+_MAX_CUT = 2.0
+"""How many times as many pairs may be across as in a new split: cameras that move change hands at some cost."""
 
 
 def partition(pairs: Mapping[tuple[str, str], float], cameras: Sequence[str], parts: int) -> list[list[str]]:
@@ -106,12 +111,6 @@ def _improve(graph: Any, chosen: np.ndarray[Any, np.dtype[np.bool_]], order: Int
         if gain > 0.0 and abs(after - size) <= slack:
             chosen[vertex], count = not chosen[vertex], after
 
-
-_WINDOW_S = 30.0  # of film that overlaps come from: what a calibration needs at least
-_MAX_EXCESS = 0.25
-"""By how much a group may be larger than its share before all are split anew; a split itself leaves a twentieth."""
-_MAX_CUT = 2.0
-"""How many times as many pairs may be across as in a new split: cameras that move change hands at some cost."""
 
 Groups = Mapping[str, Sequence[str]]
 """Cameras by hub."""

@@ -24,6 +24,14 @@ _INLIER_PX = 6.0  # RMS distance of an inlier bin, half a grid step of lag inclu
 _MIN_BIN_WEIGHT = 0.5  # of a bin's usual weight: less is not enough motion
 _MIN_BINS = _RUN_BINS * _RUNS_PER_START + 2
 _MAX_CELLS = 3_000_000  # lags times bins in a batch
+_MOMENT_INDEX = np.array(
+    [
+        [MONOMIAL_INDEX[i, j] * 6 + MONOMIAL_INDEX[k, m] for j in range(3) for m in range(3)]
+        for i in range(3)
+        for k in range(3)
+    ]
+)
+"""(9, 9): index among the 36 sums of entry (i k, j m) of the moment matrix."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,16 +167,6 @@ def _smallest_eigenvectors(cells: Floats, a: GridTrack, b: GridTrack) -> Floats:
     longest = np.argmax((power**2).sum(axis=1), axis=1)
     theta = power[np.arange(len(power)), :, longest]
     return np.asarray(theta / np.maximum(np.linalg.norm(theta, axis=1, keepdims=True), 1e-300))
-
-
-_MOMENT_INDEX = np.array(
-    [
-        [MONOMIAL_INDEX[i, j] * 6 + MONOMIAL_INDEX[k, m] for j in range(3) for m in range(3)]
-        for i in range(3)
-        for k in range(3)
-    ]
-)
-"""(9, 9): index among the 36 sums of entry (i k, j m) of the moment matrix."""
 
 
 def _bin_costs(per_bin: Floats, theta: Floats, a: GridTrack, b: GridTrack) -> Floats:

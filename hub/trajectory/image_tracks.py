@@ -42,6 +42,9 @@ _MIN_OUTLIER_PX = 1.5  # three sigma of a good detector
 _UNDERFIT_PX = 3.0  # more noise than this is rather motion too fast for the knots
 # Interpolated labels are exactly straight: without a floor the hand-set ones would look like outliers.
 _MIN_SIGMA_PX = 0.05
+_PHASE = np.linspace(0.0, np.pi, 65)[1:]
+_GAIN = (2.0 * np.sin(0.5 * _PHASE)) ** 6
+"""Gain of the squared third difference at each phase from one control point to the next."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -318,11 +321,6 @@ def _degrees_of_freedom(points: Ints, control_counts: Ints, stiffness: float) ->
     gain = _GAIN if ratio.min() >= 1.0 else (2.0 * np.sin(0.5 * _PHASE * np.minimum(ratio, 1.0)[:, None])) ** 6
     share = 1.0 / (1.0 + stiffness * gain / np.maximum(ratio, 1e-9)[:, None])
     return float((np.minimum(points, control_counts) * share.mean(axis=1)).sum())
-
-
-_PHASE = np.linspace(0.0, np.pi, 65)[1:]
-_GAIN = (2.0 * np.sin(0.5 * _PHASE)) ** 6
-"""Gain of the squared third difference at each phase from one control point to the next."""
 
 
 def _stretches(t: Floats, inlier: Bools, gap: float, part_index: Ints) -> tuple[Bools, Floats, Floats, Ints]:

@@ -20,6 +20,9 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
 
 _GENERATORS = so3.hat(np.eye(3))
+_SYMMETRIC_INDEX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Index of each entry of a symmetric 3x3 matrix among its six upper ones."""
+_REWEIGHTINGS = 4  # of a homography: outliers have lost their weight by then
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,11 +176,6 @@ def decompose_essential(essential: Floats, a: Floats, b: Floats) -> RelativePose
                 count = int(np.count_nonzero((sign * depths > 0).all(axis=0)))
                 options.append((count, RelativePose(rotation, sign * u[:, 2])))
     return max(options, key=lambda option: option[0])[1]
-
-
-_SYMMETRIC_INDEX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Index of each entry of a symmetric 3x3 matrix among its six upper ones."""
-_REWEIGHTINGS = 4  # of a homography: outliers have lost their weight by then
 
 
 def homography_residual(a: Floats, b: Floats) -> float:

@@ -22,17 +22,6 @@ if TYPE_CHECKING:
 
     from hub.view.player import Player
 
-
-def calibration_file(state: ViewState) -> str:
-    """The text of calibration.toml; "" if nothing is solved yet."""
-    solved = state.solved
-    if solved is None:
-        return ""
-    infos = {name: camera.info for name, camera in state.cameras.items() if camera.info is not None}
-    rig = Rig({name: rig_camera_from_info(info) for name, info in infos.items()}, solved.units)
-    return calibration_text(calibration_from_message(solved, infos), rig)
-
-
 ACTIONS = {
     "start_recording": "Start recording",
     "stop_recording": "Stop recording",
@@ -47,6 +36,16 @@ _HINTS = {
     "forget": "The hub no longer waits for cameras that were taken away or renamed. One that returns is located anew.",
     "export": "The hub writes its files now, and your browser downloads calibration.toml.",
 }
+
+
+def calibration_file(state: ViewState) -> str:
+    """The text of calibration.toml; "" if nothing is solved yet."""
+    solved = state.solved
+    if solved is None:
+        return ""
+    infos = {name: camera.info for name, camera in state.cameras.items() if camera.info is not None}
+    rig = Rig({name: rig_camera_from_info(info) for name, info in infos.items()}, solved.units)
+    return calibration_text(calibration_from_message(solved, infos), rig)
 
 
 class ViewPage:

@@ -37,6 +37,12 @@ MAX_READOUT_S = 0.06
 _MAX_READOUT_INTERVALS = 1.25  # frame intervals: an answer's estimated readout is at most that, and is read again
 _MAX_POINTS = 20_000  # of all rigid bodies
 _POSITION_TOLERANCE = 1e-3  # relative: position and translation may differ by rounding, not by more
+_KEYS = {
+    *("name", "size", "fps", "matrix", "distortions", "fisheye", "focal_std", "readout", "ball_outline", "position"),
+    *("position_std", "rotation", "rotation_std", "translation", "body_from_camera", "up"),
+}
+_METADATA_KEYS = {"units", "clock", "reference", "distances", "wand", "up", "bodies"}
+_LIKENESS = 0.8  # of difflib: unit for units is 0.89, and no key of a calibration.toml is above 0.78
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,14 +115,6 @@ class Rig:
         """Up (3,) in a camera's axes: as its table gives it, otherwise the camera is taken as levelled."""
         up = self.cameras[camera].up
         return np.array([0.0, -1.0, 0.0]) if up is None else up
-
-
-_KEYS = {
-    *("name", "size", "fps", "matrix", "distortions", "fisheye", "focal_std", "readout", "ball_outline", "position"),
-    *("position_std", "rotation", "rotation_std", "translation", "body_from_camera", "up"),
-}
-_METADATA_KEYS = {"units", "clock", "reference", "distances", "wand", "up", "bodies"}
-_LIKENESS = 0.8  # of difflib: unit for units is 0.89, and no key of a calibration.toml is above 0.78
 
 
 def misspelt_keys(rig: Rig) -> tuple[str, ...]:

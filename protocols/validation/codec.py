@@ -33,6 +33,8 @@ UAV_MESSAGES = (
 """The messages of a UAV agent; all have its name in the field ``agent``."""
 _CLASSES: Mapping[str, type[Message]] = {topic.message: getattr(pb, topic.message) for topic in TOPICS}
 _LAYOUTS = Layouts()
+_MAX_SENDERS = 8192
+"""Keys, and senders of observations, that are remembered."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +46,6 @@ class Address:
     agent: str
 
 
-_MAX_SENDERS = 8192
-"""Keys, and senders of observations, that are remembered."""
 _SENDERS: dict[tuple[str, str, str], Address] = {}
 """The address of each key, camera and boot id that were valid together."""
 

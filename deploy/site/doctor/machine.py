@@ -38,6 +38,20 @@ _EXTRAS = {"pymavlink": "uav", "serial": "uav", "depthai": "oak", "linuxpy": "v4
 _MAX_TEMPERATURE_C = 80.0  # boards throttle above about this
 _LOW_DISK_MB = 2000.0  # about two hours of four cameras
 Run = Callable[[Sequence[str]], tuple[int, str]]
+_CRASHES = {
+    "watchdog": "no data flowed: camera unplugged or hanging? `journalctl -u {unit}` shows when",
+    "oom-kill": "the memory was full: fewer or smaller cameras on this board, or window_s of a hub shorter",
+    "core-dump": "it crashed in a driver or library: update Syncline, and report `coredumpctl info {unit}`",
+    "signal": "somebody or something killed it: `journalctl -u {unit}`",
+    "exit-code": "it ended by itself: `journalctl -u {unit} -n 20` shows the reason",
+    "timeout": "it did not start in time: is the router up? `journalctl -u {unit}`",
+    "": "the journal does not say why (ask as root): `journalctl -u {unit} -n 50`",
+}
+_ENDS = {
+    "98e322203f7a4ed290d09fe03c09fe15": ("EXIT_CODE", "EXIT_STATUS"),
+    "d9b373ed55a64feb8242e02dbe79a49c": ("UNIT_RESULT", ""),
+}
+"""systemd's journal messages of a process that ended and of a unit that failed (sd-messages.h), and their fields."""
 
 
 def python(
@@ -243,22 +257,6 @@ def time_source(ask: Run) -> str:
 
 
 run = partial(run_command, timeout_s=10.0)
-
-
-_CRASHES = {
-    "watchdog": "no data flowed: camera unplugged or hanging? `journalctl -u {unit}` shows when",
-    "oom-kill": "the memory was full: fewer or smaller cameras on this board, or window_s of a hub shorter",
-    "core-dump": "it crashed in a driver or library: update Syncline, and report `coredumpctl info {unit}`",
-    "signal": "somebody or something killed it: `journalctl -u {unit}`",
-    "exit-code": "it ended by itself: `journalctl -u {unit} -n 20` shows the reason",
-    "timeout": "it did not start in time: is the router up? `journalctl -u {unit}`",
-    "": "the journal does not say why (ask as root): `journalctl -u {unit} -n 50`",
-}
-_ENDS = {
-    "98e322203f7a4ed290d09fe03c09fe15": ("EXIT_CODE", "EXIT_STATUS"),
-    "d9b373ed55a64feb8242e02dbe79a49c": ("UNIT_RESULT", ""),
-}
-"""systemd's journal messages of a process that ended and of a unit that failed (sd-messages.h), and their fields."""
 
 
 def crash(unit: str, run: Run = run) -> CheckResult:

@@ -6,36 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 HEADER = "# Written by `syncline install`: the next one writes it anew; a drop-in (systemctl edit) stays.\n"
-
-
-@dataclass(frozen=True, slots=True)
-class Role:
-    """System requirements of a role.
-
-    command: subcommand of `syncline`. watchdog_s: time without data flow after which systemd restarts the agent; a hub
-    sends heartbeats at every solver step. stop_s: time for a clean stop; a hub that is still solving extends it by a
-    minute at a time. devices: classes of device nodes that it may open. groups: groups that own those nodes.
-    """
-
-    command: str
-    watchdog_s: int
-    stop_s: int
-    devices: tuple[str, ...] = ()
-    groups: tuple[str, ...] = ()
-
-
 _CAMERA_NODES = ("char-video4linux", "char-usb_device")
-ROLES: dict[str, Role] = {
-    "camera": Role("camera", 10, 10, _CAMERA_NODES, ("video", "syncline")),
-    "uav": Role(
-        "uav", 10, 10, (*_CAMERA_NODES, "char-ttyACM", "char-ttyUSB", "char-ttyAMA", "char-ttyS"),
-        ("video", "dialout", "syncline"),
-    ),
-    "hub": Role("hub", 60, 60),
-    "recorder": Role("record", 15, 30),
-    "router": Role("router", 10, 10),
-}  # fmt: skip
-
 _HARDENING = """\
 NoNewPrivileges=yes
 CapabilityBoundingSet=
@@ -63,6 +34,34 @@ SystemCallFilter=~@resources @privileged
 SystemCallErrorNumber=EPERM
 UMask=0027
 """
+
+
+@dataclass(frozen=True, slots=True)
+class Role:
+    """System requirements of a role.
+
+    command: subcommand of `syncline`. watchdog_s: time without data flow after which systemd restarts the agent; a hub
+    sends heartbeats at every solver step. stop_s: time for a clean stop; a hub that is still solving extends it by a
+    minute at a time. devices: classes of device nodes that it may open. groups: groups that own those nodes.
+    """
+
+    command: str
+    watchdog_s: int
+    stop_s: int
+    devices: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
+
+
+ROLES: dict[str, Role] = {
+    "camera": Role("camera", 10, 10, _CAMERA_NODES, ("video", "syncline")),
+    "uav": Role(
+        "uav", 10, 10, (*_CAMERA_NODES, "char-ttyACM", "char-ttyUSB", "char-ttyAMA", "char-ttyS"),
+        ("video", "dialout", "syncline"),
+    ),
+    "hub": Role("hub", 60, 60),
+    "recorder": Role("record", 15, 30),
+    "router": Role("router", 10, 10),
+}  # fmt: skip
 
 
 def service(name: str, role: str, program: str, credentials: Sequence[tuple[str, str]]) -> str:

@@ -27,8 +27,22 @@ from protocols.geometry.sphere_projection import outline_to_centre
 from protocols.geometry.types import Bools, Floats
 
 _FLOOD_TOLERANCE = (26, 18, 18)  # tolerance of the flood fill in CIE L*a*b* (0..255): light and shade of a ball
-_MAX_SHARE = 0.15  # share of the image: larger regions are walls
 _MIN_PIXELS = 9  # pixels
+_STEP = 2  # of the coarse pass [px]
+_CANDIDATES = 6  # blobs that are measured, largest first
+_MIN_AREA = 6.0  # px²: smaller blobs may be colour noise
+_MAX_SHARE = 0.2  # share of the image: larger blobs are walls
+_MIN_SCORE = 0.35  # agreement of the outline times solidity: below it, blobs are no discs
+# px: largest distance of a blob's centroid from its outline's centre, plus this share of its smear
+_MAX_DISTANCE, _MAX_DISTANCE_SMEAR = 0.6, 0.04
+# px: std of a blob's centroid where the two contradict, plus this share of their distance
+_BLOB_STD, _BLOB_SHARE = 0.25, 0.2
+_BORDER = 1  # px: a blob nearer to the image border is truncated
+_MARKER_MARGIN = 8  # px around a blob that may still belong to it
+_MARGIN_KERNEL = cv2.getStructuringElement(
+    cv2.MORPH_RECT, (2 * _MARKER_MARGIN // _STEP + 1, 2 * _MARKER_MARGIN // _STEP + 1)
+)
+_LINK_KERNEL = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
 
 
 class InteractiveMarkerDetector:
@@ -72,23 +86,6 @@ def learn_marker_at(image: npt.NDArray[np.uint8], u: float, v: float) -> tuple[M
     left, top = max(x - 1, 0), max(y - 1, 0)
     box = (left, top, min(w + 2, width - left), min(h + 2, height - top))
     return learn_marker_model(image, box), box
-
-
-_STEP = 2  # of the coarse pass [px]
-_CANDIDATES = 6  # blobs that are measured, largest first
-_MIN_AREA = 6.0  # px²: smaller blobs may be colour noise
-_MAX_SHARE = 0.2  # share of the image: larger blobs are walls
-_MIN_SCORE = 0.35  # agreement of the outline times solidity: below it, blobs are no discs
-# px: largest distance of a blob's centroid from its outline's centre, plus this share of its smear
-_MAX_DISTANCE, _MAX_DISTANCE_SMEAR = 0.6, 0.04
-# px: std of a blob's centroid where the two contradict, plus this share of their distance
-_BLOB_STD, _BLOB_SHARE = 0.25, 0.2
-_BORDER = 1  # px: a blob nearer to the image border is truncated
-_MARKER_MARGIN = 8  # px around a blob that may still belong to it
-_MARGIN_KERNEL = cv2.getStructuringElement(
-    cv2.MORPH_RECT, (2 * _MARKER_MARGIN // _STEP + 1, 2 * _MARKER_MARGIN // _STEP + 1)
-)
-_LINK_KERNEL = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,6 +26,11 @@ from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 
 _MAX_BOXES = 64  # by confidence: more are noise
+_QUEUE_LENGTH = 4  # frames: older ones are discarded
+_SYNC_QUEUE_LENGTH = 16  # frames that wait for the network's result
+_REMEDY = (
+    "check cable and power, the group of /dev/bus/usb (udev rules: `syncline install`), or the address of a PoE board"
+)
 
 
 def boxes_in_image(message: Any, image: Any, size: tuple[int, int], keep: Sequence[str] = ()) -> list[NetworkBox]:
@@ -51,10 +56,6 @@ def boxes_in_image(message: Any, image: Any, size: tuple[int, int], keep: Sequen
             if 0.0 <= left + 0.5 * box.width <= size[0] and 0.0 <= top + 0.5 * box.height <= size[1]:
                 result.append(box)
     return sorted(result, key=lambda box: box.confidence, reverse=True)[:_MAX_BOXES]
-
-
-_QUEUE_LENGTH = 4  # frames: older ones are discarded
-_SYNC_QUEUE_LENGTH = 16  # frames that wait for the network's result
 
 
 @dataclass(slots=True)
@@ -180,11 +181,6 @@ class OakConnection:
             return None if device is None else float(device.getChipTemperature().average)
         except (RuntimeError, AttributeError):
             return None
-
-
-_REMEDY = (
-    "check cable and power, the group of /dev/bus/usb (udev rules: `syncline install`), or the address of a PoE board"
-)
 
 
 def open_stream(settings: OakSettings) -> OakStream:

@@ -26,6 +26,24 @@ if TYPE_CHECKING:
     from edge.uav.world.flight_world import FlightWorld
 
 _TRANSFER_S = 0.004  # from mid-exposure to the host
+GIMBAL_FROM_CAMERA: Floats = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Rotation of a camera whose optical axis is the gimbal's x axis; its image is level when the gimbal is."""
+_STEP_S = 0.01  # of the integration
+_HISTORY_S = 3.0  # of states, for sensors and images that are asked for late
+_GRAVITY = 9.81  # m/s²
+_MAX_ACCELERATION = 4.0  # m/s2: a tilt of 22 degrees
+_MAX_JERK = 8.0  # m/s³, of a multirotor that carries a camera
+_MAX_SPEED = 18.0  # m/s, the same
+_CLOSING_GAIN, _CLOSING_BRAKE = 0.4, 1.2  # 1/s, m/s2: approach gain, and deceleration when closing in
+_HOLD_GAIN = 2.0  # 1/s, velocity gain
+# Vertical, horizontal in a 4:3 image: greatest allowed angle of the target from the centre.
+_TARGET_LIMIT_RAD = np.array([0.31, 0.41])
+_OUT_OF_VIEW_RAD = np.array([0.42, 0.53])  # beyond these angles the target is out of view and the tilt is not limited
+_MIN_ACCELERATION_LIMIT = 1.5  # m/s²
+_STALE_S = 3.0  # age of the last target message after which the aircraft hovers
+_GIMBAL_RATE = np.deg2rad(70.0)
+_GIMBAL_GAIN = 5.0  # 1/s
+_VIBRATION_STD_RAD = np.deg2rad(0.05)
 
 
 class FlightCamera:
@@ -93,27 +111,6 @@ class FlightCamera:
     def close(self) -> None:
         """May be called twice."""
         self._open = False
-
-
-GIMBAL_FROM_CAMERA: Floats = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Rotation of a camera whose optical axis is the gimbal's x axis; its image is level when the gimbal is."""
-_STEP_S = 0.01  # of the integration
-_HISTORY_S = 3.0  # of states, for sensors and images that are asked for late
-_GRAVITY = 9.81  # m/s²
-_MAX_ACCELERATION = 4.0  # m/s2: a tilt of 22 degrees
-_MAX_JERK = 8.0  # m/s³, of a multirotor that carries a camera
-_MAX_SPEED = 18.0  # m/s, the same
-_CLOSING_GAIN, _CLOSING_BRAKE = 0.4, 1.2  # 1/s, m/s2: approach gain, and deceleration when closing in
-_HOLD_GAIN = 2.0  # 1/s, velocity gain
-_TARGET_LIMIT_RAD = np.array(
-    [0.31, 0.41]
-)  # vertical, horizontal in a 4:3 image: greatest allowed angle of the target from the centre
-_OUT_OF_VIEW_RAD = np.array([0.42, 0.53])  # beyond these angles the target is out of view and the tilt is not limited
-_MIN_ACCELERATION_LIMIT = 1.5  # m/s²
-_STALE_S = 3.0  # age of the last target message after which the aircraft hovers
-_GIMBAL_RATE = np.deg2rad(70.0)
-_GIMBAL_GAIN = 5.0  # 1/s
-_VIBRATION_STD_RAD = np.deg2rad(0.05)
 
 
 @dataclass(frozen=True, slots=True)

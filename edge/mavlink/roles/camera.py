@@ -25,6 +25,24 @@ _TEXTS = {
 _STARTED = ("Syncline: tracking started", mavlink.MAV_SEVERITY_NOTICE)
 StatusText = tuple[str, int]
 """At most 50 characters, and a MAV_SEVERITY."""
+MESSAGE_TYPES = ("HEARTBEAT", "COMMAND_LONG", "COMMAND_INT", "PARAM_REQUEST_LIST")
+_HEARTBEAT_S = 1.0  # of every MAVLink component
+_REPEAT_WINDOW_S = 2  # s within which identical commands are retransmissions of the station
+_DEFAULT_HZ = {"CAMERA_TRACKING_IMAGE_STATUS": 10.0, "CAMERA_TRACKING_GEO_STATUS": 5.0, "CAMERA_FOV_STATUS": 1.0}
+_REQUESTS = {
+    mavlink.MAV_CMD_REQUEST_CAMERA_INFORMATION: "CAMERA_INFORMATION",
+    mavlink.MAV_CMD_REQUEST_CAMERA_SETTINGS: "CAMERA_SETTINGS",
+    mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION: "VIDEO_STREAM_INFORMATION",
+    mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_STATUS: "VIDEO_STREAM_STATUS",
+}
+"""Commands from before MAV_CMD_REQUEST_MESSAGE, which stations still send."""
+_TRACKING = {
+    mavlink.MAV_CMD_CAMERA_TRACK_POINT: 3,
+    mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE: 4,
+    mavlink.MAV_CMD_CAMERA_STOP_TRACKING: 0,
+}
+_CAMERA_ID = _TRACKING | {mavlink.MAV_CMD_VIDEO_START_STREAMING: 2, mavlink.MAV_CMD_VIDEO_STOP_STREAMING: 2}
+"""Index of the parameter "Target Camera ID", by command."""
 
 
 class StatusTexts:
@@ -57,12 +75,6 @@ class StatusTexts:
         if state == "idle":
             self._operator = None
         return _STARTED if starts and state != "lost" else _TEXTS[state]
-
-
-MESSAGE_TYPES = ("HEARTBEAT", "COMMAND_LONG", "COMMAND_INT", "PARAM_REQUEST_LIST")
-_HEARTBEAT_S = 1.0  # of every MAVLink component
-_REPEAT_WINDOW_S = 2  # s within which identical commands are retransmissions of the station
-_DEFAULT_HZ = {"CAMERA_TRACKING_IMAGE_STATUS": 10.0, "CAMERA_TRACKING_GEO_STATUS": 5.0, "CAMERA_FOV_STATUS": 1.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,22 +311,6 @@ class _AcknowledgedCommand:
 
     def same(self, message: Any, parameters: tuple[float, ...]) -> bool:
         return bool(self.command == message.command and repr(self.parameters) == repr(parameters))
-
-
-_REQUESTS = {
-    mavlink.MAV_CMD_REQUEST_CAMERA_INFORMATION: "CAMERA_INFORMATION",
-    mavlink.MAV_CMD_REQUEST_CAMERA_SETTINGS: "CAMERA_SETTINGS",
-    mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_INFORMATION: "VIDEO_STREAM_INFORMATION",
-    mavlink.MAV_CMD_REQUEST_VIDEO_STREAM_STATUS: "VIDEO_STREAM_STATUS",
-}
-"""Commands from before MAV_CMD_REQUEST_MESSAGE, which stations still send."""
-_TRACKING = {
-    mavlink.MAV_CMD_CAMERA_TRACK_POINT: 3,
-    mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE: 4,
-    mavlink.MAV_CMD_CAMERA_STOP_TRACKING: 0,
-}
-_CAMERA_ID = _TRACKING | {mavlink.MAV_CMD_VIDEO_START_STREAMING: 2, mavlink.MAV_CMD_VIDEO_STOP_STREAMING: 2}
-"""Index of the parameter "Target Camera ID", by command."""
 
 
 def _parameters(message: Any) -> tuple[float, ...]:

@@ -11,6 +11,21 @@ from edge.scenes.common.placement import MIXED_FPS, CameraPlacement, place_camer
 from protocols.geometry.types import Floats
 from protocols.session.observations import DEFAULT_LABEL
 
+ORANGE_BGR = (22.0, 112.0, 246.0)  # of the demo's ball
+_ROOM = CameraPlacement(
+    distance=(2.5, 3.1), height=(0.6, 2.3), aim=0.15, focal=(0.72, 1.05), size=(640, 480), exposure_s=0.008
+)
+_FIELD = CameraPlacement(
+    distance=(38.0, 60.0),
+    height=(1.2, 12.0),
+    aim=2.0,
+    focal=(0.7, 0.95),
+    size=(1920, 1080),
+    exposure_s=0.004,
+    fps=MIXED_FPS,
+)
+_STREAMS = {"cameras": 0, "path": 1}  # one random stream for each part of a scene; the background has stream 2
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothPath:
@@ -68,23 +83,6 @@ def flown_path(rng: np.random.Generator, centre: Floats, extent: Floats) -> Smoo
     pause_phase = rng.uniform(0.0, 2.0 * np.pi, 2)
     depth = np.array([0.52, 0.46])
     return SmoothPath(centre, extent, amplitude, frequency, phase, depth, rng.uniform(0.02, 0.06, 2), pause_phase)
-
-
-ORANGE_BGR = (22.0, 112.0, 246.0)  # of the demo's ball
-
-_ROOM = CameraPlacement(
-    distance=(2.5, 3.1), height=(0.6, 2.3), aim=0.15, focal=(0.72, 1.05), size=(640, 480), exposure_s=0.008
-)
-_FIELD = CameraPlacement(
-    distance=(38.0, 60.0),
-    height=(1.2, 12.0),
-    aim=2.0,
-    focal=(0.7, 0.95),
-    size=(1920, 1080),
-    exposure_s=0.004,
-    fps=MIXED_FPS,
-)
-_STREAMS = {"cameras": 0, "path": 1}  # one random stream for each part of a scene; the background has stream 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)

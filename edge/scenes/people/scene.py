@@ -13,8 +13,6 @@ from protocols.geometry.types import Bools, Floats
 
 HIDDEN_PX = 3.0
 """A head top or foot point at least this far inside a nearer body's box is occluded."""
-
-
 MAX_PEOPLE = 12  # in the room
 ROOM = (5.0, 3.0)
 """Half the side and the height [m] of the room."""
@@ -32,6 +30,14 @@ _CAMERAS = CameraPlacement(
 _STREAMS = {"cameras": 0, "people": 1}  # the background has stream 2
 RADII = {"head": 0.062, "neck": 0.032, "torso": 0.085, "pelvis": 0.075, "arm": 0.028, "thigh": 0.05, "shank": 0.036}
 """Radii of the parts of a body, over its height."""
+_SKIN = ((150, 178, 224), (120, 150, 205), (84, 112, 165), (60, 82, 128))  # BGR
+_HAIR = ((30, 36, 48), (48, 72, 105), (92, 140, 178), (122, 124, 128))  # BGR
+_TOPS = (
+    (52, 44, 190), (165, 92, 40), (70, 140, 60), (215, 216, 220), (48, 46, 50), (40, 170, 215), (150, 70, 130),
+    (120, 118, 112), (165, 150, 60), (80, 110, 200), (110, 60, 40), (60, 90, 100),
+)  # fmt: skip
+_TROUSERS = ((92, 60, 44), (42, 42, 46), (118, 138, 150), (70, 84, 96), (140, 100, 70), (60, 62, 90))  # BGR
+_SHOES = ((40, 42, 48), (205, 206, 210), (50, 70, 110))  # BGR
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,16 +123,6 @@ def joint_radii(heights: Floats) -> Floats:
     share |= {"pelvis": RADII["pelvis"], "shoulder": 0.045, "elbow": RADII["arm"], "hand": RADII["arm"]}
     share |= {"hip": RADII["thigh"], "knee": RADII["shank"], "ankle": 0.03, "toe": 0.02}
     return np.asarray(heights[:, None] * np.array([share[name.partition("_")[0]] for name in JOINTS]))
-
-
-_SKIN = ((150, 178, 224), (120, 150, 205), (84, 112, 165), (60, 82, 128))  # BGR
-_HAIR = ((30, 36, 48), (48, 72, 105), (92, 140, 178), (122, 124, 128))  # BGR
-_TOPS = (
-    (52, 44, 190), (165, 92, 40), (70, 140, 60), (215, 216, 220), (48, 46, 50), (40, 170, 215), (150, 70, 130),
-    (120, 118, 112), (165, 150, 60), (80, 110, 200), (110, 60, 40), (60, 90, 100),
-)  # fmt: skip
-_TROUSERS = ((92, 60, 44), (42, 42, 46), (118, 138, 150), (70, 84, 96), (140, 100, 70), (60, 62, 90))  # BGR
-_SHOES = ((40, 42, 48), (205, 206, 210), (50, 70, 110))  # BGR
 
 
 def people_room(seed: int, cameras: int, people: int) -> PeopleScene:

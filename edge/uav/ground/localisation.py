@@ -22,6 +22,10 @@ CAR_LENGTH = 4.5
 _MIN_LENGTH, _MAX_LENGTH = 0.3, 30.0  # of a plausible target [m]: a person from above is 0.5 m
 _MIN_HEIGHT = 2.0  # of the camera for a plausible position [m]
 _MAX_RANGE_RATIO = 12.0  # horizontal distance over height: beyond, the target is near the horizon
+_CONVERGED_STD_S = 0.04  # of the clock offset, for which telemetry is used
+_ATTITUDE_STD = np.deg2rad(1.0)  # of the absolute attitude as a measurement, per frame
+_POSITION_STD = np.array([4.0, 4.0, 2.0])  # [m]; with less, drift of the receiver would appear as speed of the target
+_MIN_ATTITUDE_ERROR = np.deg2rad(1.5)  # of the initial attitude for which the ground frame is changed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,12 +95,6 @@ def _is_within_range(pose: PlanePose, normalised: Floats) -> bool:
         return False
     distance = np.linalg.norm(ground - pose.centre[:2], axis=1).max()
     return bool(distance < _MAX_RANGE_RATIO * abs(float(pose.centre[2])))
-
-
-_CONVERGED_STD_S = 0.04  # of the clock offset, for which telemetry is used
-_ATTITUDE_STD = np.deg2rad(1.0)  # of the absolute attitude as a measurement, per frame
-_POSITION_STD = np.array([4.0, 4.0, 2.0])  # [m]; with less, drift of the receiver would appear as speed of the target
-_MIN_ATTITUDE_ERROR = np.deg2rad(1.5)  # of the initial attitude for which the ground frame is changed
 
 
 class CameraLocaliser:

@@ -16,6 +16,13 @@ from edge.uav.target.motion_history import MotionFit
 from protocols.geometry.types import Floats
 
 _UNKNOWN_CURVATURE_STD = 0.008  # of road that was not observed [1/unit]
+_RETRACE_EVERY = 8  # frames
+_PARTICLE_COUNT = 400  # over all paths: more cost CPU, fewer leave an unlikely turn without any
+_ON_PATH_SHARE = 0.92  # of the particles, where the target drove on the road
+_TURN_PROBABILITY, _BRAKING_TURN_GAIN = 0.36, 0.4  # prior at a junction, and its increase for a braking driver
+_MAX_ACCELERATION_STD = 1.5  # of an acceleration that is used
+_BRAKING_ACCELERATION = -0.7  # longitudinal acceleration below which the driver is braking [units/s²]
+_MIN_ROAD_SHARE = 0.5  # share of the trail on road for which paths are used
 
 
 def assign_paths(particles: ParticleSet, paths: list[RoadPath], share: float, rng: np.random.Generator) -> ParticleSet:
@@ -58,15 +65,6 @@ def reassign_paths(
         switches = eligible & (rng.random(len(particles)) < other.weight / (other.weight + base.weight))
         assigned = np.where(switches, k, assigned)
     return replace(particles, path=assigned)
-
-
-_RETRACE_EVERY = 8  # frames
-_PARTICLE_COUNT = 400  # over all paths: more cost CPU, fewer leave an unlikely turn without any
-_ON_PATH_SHARE = 0.92  # of the particles, where the target drove on the road
-_TURN_PROBABILITY, _BRAKING_TURN_GAIN = 0.36, 0.4  # prior at a junction, and its increase for a braking driver
-_MAX_ACCELERATION_STD = 1.5  # of an acceleration that is used
-_BRAKING_ACCELERATION = -0.7  # longitudinal acceleration below which the driver is braking [units/s²]
-_MIN_ROAD_SHARE = 0.5  # share of the trail on road for which paths are used
 
 
 class OcclusionPredictor:

@@ -22,6 +22,7 @@ from protocols.geometry.types import Bools, Floats, Ints
 
 Observation_contra = TypeVar("Observation_contra", contravariant=True)
 Observation = TypeVar("Observation")
+_STRIDES = (1, 1 << 21, 1 << 42, 1 << 52)  # packs a cell's coordinates into one integer
 
 
 class Model(Protocol[Observation_contra]):
@@ -229,9 +230,6 @@ def clusters(
         remaining &= np.square(points - part.centre).sum(axis=1) > 4.0 * radius * radius
         remaining &= ~members
     return tuple(found)
-
-
-_STRIDES = (1, 1 << 21, 1 << 42, 1 << 52)  # packs a cell's coordinates into one integer
 
 
 def _keys(index: Ints) -> Ints:

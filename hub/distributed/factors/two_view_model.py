@@ -22,6 +22,7 @@ from protocols.geometry.types import Bools, Floats
 _MIN_DEPTH_SHARE = 1e-3
 """Least depth of a triangulated point, as a share of its distance."""
 _POINT_STEPS = 1  # Gauss-Newton steps: the linear point is near
+_EYE = np.eye(3)
 
 
 def small_log(rotation: Floats) -> Floats:
@@ -136,9 +137,6 @@ def linearise_observations(pose: RelativeTransform, rows: Floats, weights: Float
     return LinearisedObservations(
         turned @ information @ by_pose, (turned @ gradient[:, :, None])[:, :, 0], chi2, in_front
     )
-
-
-_EYE = np.eye(3)
 
 
 def _point_information(
