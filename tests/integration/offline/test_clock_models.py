@@ -21,6 +21,8 @@ FAST = replace(USUAL, fps=(10.0, 12.0, 10.0, 15.0), fastest=2.5)
         ("readout+jitter5", USUAL),  # the estimated frame times took the readout up
         ("readout+jitter5", replace(USUAL, fps=FAST.fps)),
         ("readouts", FAST),  # were jitter
+        ("reversed", USUAL),  # other cameras had readouts, or clocks whose rate changes
+        ("readouts+reversed", USUAL),
         ("step15", FAST),  # residuals that change sign from frame to frame were taken for white
         ("step30+jitter10", FAST),
         ("jitter20", replace(USUAL, focal_error=0.01)),
