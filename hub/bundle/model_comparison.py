@@ -272,9 +272,10 @@ def are_readouts_plausible(problem: Problem, state: AdjustmentState) -> bool:
 
 
 def _reversed_cameras(problem: Problem, state: AdjustmentState) -> set[int]:
-    """Cameras that clearly read their last row first."""
+    """Cameras that clearly read their last row first. Portrait pictures are as often turned to the left as right."""
+    needed = [1.0 if lens.is_portrait else _REVERSED_EVIDENCE for lens in problem.nominal]
     evidence = _readout_evidence(problem, state)
-    return {i for i, one in evidence.items() if one > _REVERSED_EVIDENCE and state.cameras[i].readout < 0.0}
+    return {i for i, one in evidence.items() if one > needed[i] and state.cameras[i].readout < 0.0}
 
 
 def without_negative_readouts(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
