@@ -462,6 +462,7 @@ def rig_camera_from_info(info: pb.CameraInfo) -> RigCamera:
         rotation=None if len(info.rotation) != 3 else so3.exp(np.array(info.rotation)),
         position_std=_vector(info.position_std),
         rotation_std=_vector(info.rotation_std),
+        focal_std=info.focal_std,
         readout=min(max(info.readout_s, -longest), longest) or None,
         table={"name": info.camera, "size": [info.width, info.height], "fps": info.fps},
     )

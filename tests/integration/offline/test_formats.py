@@ -385,7 +385,9 @@ def test_frames_get_the_videos_own_times(tmp_path: Path) -> None:
 
 def test_a_session_becomes_a_log_and_a_session_again(tmp_path: Path) -> None:
     assert run(["simulate", "marker", "--seconds", "2", "--cameras", "2", "--out", str(tmp_path / "s")]) == 0
-    text = (tmp_path / "s" / "rig.toml").read_text().replace("fps = 30.0", "fps = 30.0\nreadout = -0.012")
+    text = (
+        (tmp_path / "s" / "rig.toml").read_text().replace("fps = 30.0", "fps = 30.0\nreadout = -0.012\nfocal_std = 0.1")
+    )
     (tmp_path / "s" / "rig.toml").write_text(text + "\n[metadata.more]\nx = 1\n" if "[metadata]" not in text else text)
     log, again = tmp_path / "s.mcap", tmp_path / "again"
     assert run(["import", str(tmp_path / "s"), "--out", str(log)]) == 0
@@ -394,7 +396,7 @@ def test_a_session_becomes_a_log_and_a_session_again(tmp_path: Path) -> None:
     assert list(rig_again.cameras) == list(rig.cameras)
     for name, was in rig.cameras.items():
         now = rig_again.cameras[name]
-        assert (now.size, now.fps, now.readout) == (was.size, was.fps, -0.012)
+        assert (now.size, now.fps, now.readout, now.focal_std) == (was.size, was.fps, -0.012, 0.1)
         assert was.intrinsics is not None and now.intrinsics is not None  # noqa: PT018
         np.testing.assert_array_equal(now.intrinsics.matrix, was.intrinsics.matrix)
         np.testing.assert_array_equal(now.intrinsics.distortions, was.intrinsics.distortions)
