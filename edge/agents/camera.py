@@ -254,6 +254,7 @@ class CameraAgent:
             message.distortions.extend(lens.distortions.tolist())
             message.fisheye = lens.fisheye
         if known is not None:
+            message.focal_std = known.focal_std if lens is known.intrinsics else 0.0
             add_rig_pose(message, known)
         return message
 

@@ -43,6 +43,8 @@ _FALSE_ALARM_PROBABILITY = 1e-4
 """Probability that one of the lenses of a correct rig is refuted."""
 _READOUT_MARGIN = 0.25
 """Error of an estimated readout, in frame intervals, that is plausible: a global shutter's comes out at about 0."""
+_REVERSED_EVIDENCE = 4.0
+"""Of what a readout needs, for one below 0: seven stds. Slightly wrong lenses made readouts of -3.4 stds."""
 _TESTED_AT_ONCE = 64  # cameras: of all, their columns would be as large as the matrix
 _TANGENTIAL_SHARE = 0.25
 """Of what free principal points gain: a ninth of it at most in six mirrored rigs, all of it in others."""
@@ -243,36 +245,43 @@ def with_free_readouts(problem: Problem) -> Problem:
 
 
 def are_readouts_supported(problem: Problem, state: AdjustmentState) -> bool:
-    """Whether all estimated readouts are plausible and one of them is significant.
+    """Whether all estimated readouts are plausible and one of them is significant."""
+    return are_readouts_plausible(problem, state) and max(_readout_evidence(problem, state).values(), default=0.0) > 1.0
 
-    A sensor is read from its first row to its last before the next frame, in at most `MAX_READOUT_S`; given readouts
-    may say otherwise.
-    """
+
+def _readout_evidence(problem: Problem, state: AdjustmentState) -> dict[int, float]:
+    """By camera whose readout was not given, its chi-squared over what a parameter of a clock needs."""
     linear, needed = LinearisedModel.in_its_noise(*weighted_by_jitter(problem, state)), evidence_needed(problem, 1)
-    values = {column: state.cameras[camera].readout for camera, (column,) in linear.readouts().items()}
-    variance = linear.covariance.diagonal()
-    return are_readouts_plausible(problem, state) and any(
-        value**2 > needed * variance[column] for column, value in values.items()
-    )
+    variance = linear.covariance.diagonal() * needed
+    return {camera: state.cameras[camera].readout ** 2 / variance[k] for camera, (k,) in linear.readouts().items()}
 
 
 def are_readouts_plausible(problem: Problem, state: AdjustmentState) -> bool:
-    """Whether all readouts are within the range of real cameras: from 0 to a frame interval.
+    """Whether all readouts are within the range of real cameras: up to a frame interval, in either direction.
 
-    A sensor is read from its first row to its last before the next frame; given readouts may say otherwise.
+    A sensor is read from its first row to its last before the next frame, in at most `MAX_READOUT_S`; given readouts
+    may say otherwise. Of one that is mounted upside down and turns its picture, the last row is read first: that takes
+    more evidence.
     """
-    for number, camera in enumerate(state.cameras):
-        longest = problem.longest_readout(number)
-        most = min((1.0 + _READOUT_MARGIN) * longest, MAX_READOUT_S)
-        if not -_READOUT_MARGIN * longest < camera.readout < most:
-            return False
-    return True
+    longest = np.array([problem.longest_readout(camera) for camera in range(len(state.cameras))])
+    readout = np.array([camera.readout for camera in state.cameras])
+    if (np.abs(readout) >= np.minimum((1.0 + _READOUT_MARGIN) * longest, MAX_READOUT_S)).any():
+        return False
+    below = set(np.flatnonzero(readout <= -_READOUT_MARGIN * longest).tolist())
+    return not below or below <= _reversed_cameras(problem, state)
+
+
+def _reversed_cameras(problem: Problem, state: AdjustmentState) -> set[int]:
+    """Cameras that clearly read their last row first. Portrait pictures are as often turned to the left as right."""
+    needed = [1.0 if lens.is_portrait else _REVERSED_EVIDENCE for lens in problem.nominal]
+    evidence = _readout_evidence(problem, state)
+    return {i for i, one in evidence.items() if one > needed[i] and state.cameras[i].readout < 0.0}
 
 
 def without_negative_readouts(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:
-    """The problem with readouts that came out below 0 held there: those of global shutters."""
-    below = [camera.readout < 0.0 for camera in state.cameras]
-    given = problem.readout_given or (False,) * len(below)
-    cameras = [replace(one, readout=max(one.readout, 0.0)) for one in state.cameras]
+    """The problem with readouts that came out below 0, but not clearly, held there: those of global shutters."""
+    clear, given = _reversed_cameras(problem, state), problem.readout_given or (False,) * len(state.cameras)
+    below = [camera.readout < 0.0 and i not in clear for i, camera in enumerate(state.cameras)]
+    cameras = [replace(one, readout=0.0) if held else one for one, held in zip(state.cameras, below, strict=True)]
     held = tuple(a or b for a, b in zip(given, below, strict=True))
     return replace(problem, readout_given=held), replace(state, cameras=tuple(cameras))

@@ -118,14 +118,13 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
         # Given rolling-shutter readout: every image row has its own time; the frame's time is that of the middle row.
         # With a shared clock, observations correspond by equal times, which are kept.
         readout = 0.0 if rig.shared_clock else rig_camera.readout or 0.0
-        last_row = max(rig_camera.size[1] - 1, 1)
         for track in tracks:
             pixels = track.pixels
             if rig_camera.ball_outline:
                 outlines.setdefault(name, {})[labels.index(track.label)] = pixels, track.size
                 if not is_uncalibrated:
                     pixels = outline_to_centre(pixels, track.size, lens)
-            time = track.time + readout * (np.clip(track.pixels[:, 1], 0, last_row) / last_row - 0.5)
+            time = track.time + readout * lens.row_offset(track.pixels)
             normalised = lens.unproject(pixels)
             relative = _relative_stds(track, tracks)
             cleaned: ImageTrack | None

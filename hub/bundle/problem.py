@@ -36,7 +36,7 @@ class CameraState:
     The time map is parametrised about ``centre``, the middle of the camera's observed span, so that offset and
     rate are nearly uncorrelated: ``t = rate * (t_camera - centre) + offset`` with t the internal
     reference time [s] and t_camera relative to the camera's epoch. readout: rolling-shutter readout time [s] from the
-    image's first row to its last, negative where the last row is read first; camera times are those of the middle row.
+    sensor's first row to its last, negative where the last row is read first; camera times are those of the middle row.
     """
 
     intrinsics: Intrinsics
@@ -47,9 +47,8 @@ class CameraState:
     readout: float = 0.0
 
     def row_offset(self, pixels: Floats) -> Floats:
-        """Image row (n,) of pixels (n, 2) relative to the middle row: -0.5 in the first row, 0.5 in the last."""
-        height = max(self.intrinsics.height - 1, 1)
-        return np.asarray(np.clip(pixels[:, 1], 0, height) / height - 0.5)
+        """The sensor's row (n,) of pixels (n, 2): `Intrinsics.row_offset`."""
+        return self.intrinsics.row_offset(pixels)
 
     def row_time(self, time: Floats, pixels: Floats) -> Floats:
         """Camera times (n,) at which the rows of pixels (n, 2) were read, in frames with times ``time`` (n,)."""

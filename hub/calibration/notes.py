@@ -99,7 +99,8 @@ def readout_notes(cameras: dict[str, CameraCalibration], by: str) -> tuple[str, 
     """One sentence for each rolling-shutter readout that was estimated ``by`` something."""
     return tuple(
         f"{name}: its rolling-shutter readout was estimated from {by}: "
-        f"{1e3 * camera.readout:.1f} ms from the first row to the last ± {1e3 * camera.readout_std:.1f} ms (std)"
+        f"{1e3 * camera.readout:.1f} ms from the first {'column' if camera.intrinsics.is_portrait else 'row'} "
+        f"to the last ± {1e3 * camera.readout_std:.1f} ms (std)"
         for name, camera in cameras.items()
         if camera.readout_std > 0.0
     )

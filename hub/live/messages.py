@@ -12,6 +12,7 @@ from protocols.core.version import VERSION
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
+from protocols.session.builder import rig_camera_from_info
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable
 from protocols.session.rig import Rig
 from protocols.validation.codec import MAX_PAYLOAD
@@ -59,7 +60,7 @@ def calibration_from_message(message: pb.Calibration, infos: Mapping[str, pb.Cam
     for found in message.cameras:
         info = infos.get(found.camera)
         lens = None if info is None else Intrinsics.of_message(found, (info.width, info.height))
-        if lens is not None:
+        if info is not None and lens is not None:
             cameras[found.camera] = CameraCalibration(
                 name=found.camera,
                 intrinsics=lens,
@@ -68,6 +69,7 @@ def calibration_from_message(message: pb.Calibration, infos: Mapping[str, pb.Cam
                 time_offset_std=found.time_offset_std,
                 position_std=np.array(found.position_std) if found.position_std else np.zeros(3),
                 rms_px=found.rms_px,
+                readout=rig_camera_from_info(info).readout or 0.0,
                 lag_time=found.lag_time_s,
                 lag_std=found.time_offset_std,
                 clock_rate_std=found.clock_rate_std,

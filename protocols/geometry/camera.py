@@ -70,6 +70,19 @@ class Intrinsics:
         """Mean focal length [px]: pixels per radian on the optical axis."""
         return float(0.5 * (self.matrix[0, 0] + self.matrix[1, 1]))
 
+    @property
+    def is_portrait(self) -> bool:
+        """Whether the image is higher than wide: turned by 90°, as sensors have long rows."""
+        return self.height > self.width
+
+    def row_offset(self, pixels: Floats) -> Floats:
+        """The sensor's row (n,) of pixels (n, 2) relative to its middle: -0.5 in the first one, 0.5 in the last.
+
+        Of a portrait image the sensor's rows are the columns.
+        """
+        last = max(min(self.width, self.height) - 1, 1)
+        return np.asarray(np.clip(pixels[:, 0 if self.is_portrait else 1], 0, last) / last - 0.5)
+
     def project(self, points: Floats) -> Floats:
         """Distorted pixels (n, 2) of points (n, 3) in camera axes; NaN where z <= 0 (pinhole) or beyond the fold."""
         points = np.asarray(points, dtype=np.float64)

@@ -65,7 +65,7 @@ class Observation(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., camera: _Optional[str] = ..., boot_id: _Optional[str] = ..., sequence: _Optional[int] = ..., frame: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., exposure_ns: _Optional[int] = ..., detections: _Optional[_Iterable[_Union[Detection, _Mapping]]] = ...) -> None: ...
 
 class CameraInfo(_message.Message):
-    __slots__ = ("schema_version", "camera", "boot_id", "width", "height", "fps", "matrix", "distortions", "fisheye", "driver", "clock", "position", "rotation", "position_std", "rotation_std", "readout_s", "target")
+    __slots__ = ("schema_version", "camera", "boot_id", "width", "height", "fps", "matrix", "distortions", "fisheye", "driver", "clock", "position", "rotation", "position_std", "rotation_std", "readout_s", "target", "focal_std")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
@@ -83,6 +83,7 @@ class CameraInfo(_message.Message):
     ROTATION_STD_FIELD_NUMBER: _ClassVar[int]
     READOUT_S_FIELD_NUMBER: _ClassVar[int]
     TARGET_FIELD_NUMBER: _ClassVar[int]
+    FOCAL_STD_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     camera: str
     boot_id: str
@@ -100,7 +101,8 @@ class CameraInfo(_message.Message):
     rotation_std: _containers.RepeatedScalarFieldContainer[float]
     readout_s: float
     target: str
-    def __init__(self, schema_version: _Optional[int] = ..., camera: _Optional[str] = ..., boot_id: _Optional[str] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., fps: _Optional[float] = ..., matrix: _Optional[_Iterable[float]] = ..., distortions: _Optional[_Iterable[float]] = ..., fisheye: _Optional[bool] = ..., driver: _Optional[str] = ..., clock: _Optional[str] = ..., position: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., position_std: _Optional[_Iterable[float]] = ..., rotation_std: _Optional[_Iterable[float]] = ..., readout_s: _Optional[float] = ..., target: _Optional[str] = ...) -> None: ...
+    focal_std: float
+    def __init__(self, schema_version: _Optional[int] = ..., camera: _Optional[str] = ..., boot_id: _Optional[str] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., fps: _Optional[float] = ..., matrix: _Optional[_Iterable[float]] = ..., distortions: _Optional[_Iterable[float]] = ..., fisheye: _Optional[bool] = ..., driver: _Optional[str] = ..., clock: _Optional[str] = ..., position: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., position_std: _Optional[_Iterable[float]] = ..., rotation_std: _Optional[_Iterable[float]] = ..., readout_s: _Optional[float] = ..., target: _Optional[str] = ..., focal_std: _Optional[float] = ...) -> None: ...
 
 class RigInfo(_message.Message):
     __slots__ = ("schema_version", "units", "clock", "distances", "up", "up_camera", "reference_camera")

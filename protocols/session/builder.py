@@ -21,7 +21,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_columns
-from protocols.session.rig import Rig, RigCamera
+from protocols.session.rig import Rig, RigCamera, longest_readout
 
 _DUPLICATE_WINDOW = 16_384
 """Sequence numbers of one run that a live hub remembers to detect duplicates: nine minutes at 30 Hz; 2 KiB a camera."""
@@ -452,6 +452,7 @@ def rig_camera_from_info(info: pb.CameraInfo) -> RigCamera:
         matrix = np.array(info.matrix).reshape(3, 3)
         distortions = np.array(info.distortions) if info.distortions else np.zeros(4 if info.fisheye else 5)
         lens = Intrinsics(info.width, info.height, matrix, distortions, info.fisheye)
+    longest = longest_readout(info.fps)  # a configuration's may be longer than a rig.toml may say
     return RigCamera(
         name=info.camera,
         size=(info.width, info.height),
@@ -461,6 +462,8 @@ def rig_camera_from_info(info: pb.CameraInfo) -> RigCamera:
         rotation=None if len(info.rotation) != 3 else so3.exp(np.array(info.rotation)),
         position_std=_vector(info.position_std),
         rotation_std=_vector(info.rotation_std),
+        focal_std=info.focal_std,
+        readout=min(max(info.readout_s, -longest), longest) or None,
         table={"name": info.camera, "size": [info.width, info.height], "fps": info.fps},
     )
 

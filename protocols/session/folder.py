@@ -19,6 +19,8 @@ from protocols.session.rig import Rig, misspelt_keys, read_rig
 RIG_FILE = "rig.toml"
 OBSERVATIONS_FILE = "observations.csv"
 _MANY_TIMES = 10  # distinct ones that are all whole by chance: of stamps in tenths of a second one set in 10^10
+_WRONG_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+_SAME_INTERVAL = 0.2  # relative: rows that are so near a frame's interval apart, in such a unit, are in it
 _MANY_ROWS, _SMALL_PICTURE = 100, 0.55
 """Rows of a camera, and the share of its width and of its height that they reach in every camera: those of pictures of
 half the size reach a half."""
@@ -51,8 +53,8 @@ def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Ob
 
 
 def column_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
-    """Warnings for cameras with many rows outside their image or with times that are frame numbers or milliseconds, and
-    for pixels of smaller images. Raises InputError for the first of `pixel_faults`."""
+    """Warnings for cameras with many rows outside their image or with times that are frame numbers, and for pixels of
+    smaller images. Raises InputError for the first of `pixel_faults`, and for times in milliseconds."""
     for fault in pixel_faults(rig, observations).values():
         raise fault
     warnings = []
@@ -64,11 +66,18 @@ def column_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
             warnings.append(
                 f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image; check size, u, v"
             )
-        times = np.concatenate([np.zeros(0), *(track.time for track in observations.of_camera(name))])
-        if camera.fps > 1.0 and len(np.unique(times)) >= _MANY_TIMES and (times == np.rint(times)).all():
+        times = np.unique(np.concatenate([np.zeros(0), *(track.time for track in observations.of_camera(name))]))
+        frames = float(np.median(np.diff(times))) * camera.fps if len(times) >= _MANY_TIMES else 0.0
+        for unit, factor in _WRONG_UNITS.items():
+            if abs(frames / factor - 1.0) < _SAME_INTERVAL and not rig.shared_clock:
+                text = (
+                    f"{name}: its times are {unit}: {frames / camera.fps:.4g} apart, at {camera.fps:g} frames a second"
+                )
+                raise InputError(text, remedy=f"divide them by {factor:g}: times are seconds")
+        if camera.fps > 1.0 and len(times) >= _MANY_TIMES and (times == np.rint(times)).all():
             warnings.append(
                 f"{name}: all its times are whole numbers of seconds, though it films {camera.fps:g} frames a second; "
-                "frame numbers have to be divided by the frame rate, milliseconds by 1000"
+                "frame numbers have to be divided by the frame rate"
             )
     return (*warnings, *([text] if (text := small_pictures(rig, observations)) else []))
 

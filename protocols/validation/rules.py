@@ -258,7 +258,8 @@ def _camera_info(message: pb.CameraInfo) -> None:
     _bounded(message.rotation, "rotation", (0, 3), MAX_TURN)
     _stds(message.position_std, "position_std", (0, 3), MAX_LENGTH)
     _stds(message.rotation_std, "rotation_std", (0, 3), MAX_TURN)
-    _number(message.readout_s, "readout_s", 0.0, 10.0)
+    _number(message.readout_s, "readout_s", -10.0, 10.0)
+    _number(message.focal_std, "focal_std", 0.0, 2.0)
 
 
 _UNITS = frozenset({"m", "cm", "mm"})

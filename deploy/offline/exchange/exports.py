@@ -24,20 +24,19 @@ def calibration_files(source: Path, to: str, out: Path) -> tuple[dict[Path, str]
     scale = str(rig.metadata.get("scale", "metric"))
     if to in toml_rigs.PROJECT_UNITS:
         written = toml_rigs.write(to, cameras, rig.units, scale, out.name)
-    elif to == "kalibr":
-        metric, warnings = convert_units(cameras, rig.units, "m", scale)
-        written = yaml_rigs.write_kalibr(metric, out.name)
-        written = ExportedFiles(written.files, warnings + written.warnings)
     elif to == "opencv":
         written = yaml_rigs.write_opencv(cameras, rig.units)
     elif to == "ros":
         written = yaml_rigs.write_ros(cameras)
-    elif to == "opensfm":
-        written = opensfm.write(cameras, out.name)
     elif to in xml_export.UNITS:
         written = xml_export.write(to, cameras, rig.units, scale, out.name)
-    else:
-        written = colmap.write(cameras)
+    else:  # their files state no units, and are read as metres
+        metric, warnings = convert_units(cameras, rig.units, "m", scale)
+        if to == "kalibr":
+            written = yaml_rigs.write_kalibr(metric, out.name)
+        else:
+            written = opensfm.write(metric, out.name) if to == "opensfm" else colmap.write(metric)
+        written = ExportedFiles(written.files, warnings + written.warnings)
     folder = out if to in IN_FOLDERS else out.parent
     return {file_in(folder, name): text for name, text in written.files.items()}, written.warnings
 

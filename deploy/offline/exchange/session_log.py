@@ -151,6 +151,10 @@ def rig_tables_of_log(rig: Rig) -> dict[str, Any]:
         table: dict[str, Any] = {"name": name, "size": list(camera.size)}
         if camera.fps:
             table["fps"] = camera.fps
+        if camera.readout is not None:
+            table["readout"] = camera.readout
+        if camera.focal_std:
+            table["focal_std"] = camera.focal_std
         lens = camera.intrinsics
         if lens is not None:
             table |= lens.table()
@@ -172,6 +176,7 @@ def camera_info(rig: Rig, name: str) -> pb.CameraInfo:
     info = pb.CameraInfo(schema_version=SCHEMA_VERSION, camera=name, boot_id="import", driver="import", clock="device")
     info.target = str(rig.metadata.get("target", ""))
     info.width, info.height, info.fps = camera.size[0], camera.size[1], camera.fps
+    info.readout_s, info.focal_std = camera.readout or 0.0, camera.focal_std
     if camera.intrinsics is not None:
         info.matrix.extend(camera.intrinsics.matrix.ravel().tolist())
         info.distortions.extend(camera.intrinsics.distortions.tolist())

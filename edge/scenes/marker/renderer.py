@@ -69,8 +69,7 @@ class MarkerRenderer(Renderer):
         steps = int(np.clip(np.ceil(2.0 * smear), 1, _MAX_STEPS))
         instants = true_time + camera.exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
         if camera.readout_s:  # the ball's position when its own row is read
-            row = np.clip(pixels[1, 1], 0, lens.height - 1)
-            instants = instants + camera.readout_s * (row / (lens.height - 1) - 0.5)
+            instants = instants + camera.readout_s * lens.row_offset(pixels[1:2])
         centres = camera.pose.camera_from_world(self._scene.marker_position(instants))
         cover, light = self._ball(rays, centres)
         patch = image[top:bottom, left:right].astype(np.float64) + PEDESTAL

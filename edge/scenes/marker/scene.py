@@ -121,8 +121,7 @@ class MarkerScene(SimulatedScene):
             points = np.where((view_tangent < reach)[:, None], points, np.nan)
             pixels = lens.project(points)
             if simulated.readout_s:
-                row = np.nan_to_num(pixels[:, 1], nan=0.5 * (lens.height - 1))
-                lag = (np.clip(row, 0, lens.height - 1) / (lens.height - 1) - 0.5) * simulated.readout_s
+                lag = np.nan_to_num(lens.row_offset(pixels)) * simulated.readout_s
         normalised = points[:, :2] / points[:, 2:]
         scale = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(lens.pixel_jacobian(normalised)))))
         # A sphere's outline is a cone of half-angle a, sin(a) = radius / distance. The image plane cuts it, at the

@@ -121,7 +121,7 @@ def _wanders(
     *,
     further: bool,
 ) -> dict[int, Wander]:
-    """The clocks that wander: those that are ``known`` to, and the one of the others that does most, if any does.
+    """The clocks that wander: those that are ``known`` to and still gain, and the one of the others that does most.
 
     further: whether one of the others may: not while the path still follows a known one. instants: (cameras,) internal
     times at which the even clocks agree with them; None = that of the last frames. The likelihood ratio has to be more
@@ -150,7 +150,8 @@ def _wanders(
     limit = across + float(chdtri(1, 2.0 * _WANDER_FALSE_ALARM / len(parts)))
     others = (one for one in found.values() if further and one.camera not in known and one.is_plausible)
     new = max(others, key=lambda one: one.gain, default=None)
-    return {camera: one for camera, one in found.items() if camera in known or (one is new and one.gain > limit)}
+    least = {camera: 0.0 if camera in known else limit for camera in found}
+    return {i: one for i, one in found.items() if one.gain > least[i] and (i in known or one is new)}
 
 
 def weighted_by_jitter(problem: Problem, state: AdjustmentState) -> tuple[Problem, AdjustmentState]:

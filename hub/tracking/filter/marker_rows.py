@@ -65,7 +65,8 @@ def marker_row(
         a * c * uu + (a * d + b * c) * uv + b * d * vv,
         c * c * uu + 2.0 * c * d * uv + d * d * vv,
     )
-    row_ns = round(camera.readout * 1e9 * (min(max(detection.v / max(lens.height - 1, 1), 0.0), 1.0) - 0.5))
+    row, rows = (detection.u, lens.width) if lens.is_portrait else (detection.v, lens.height)
+    row_ns = round(camera.readout * 1e9 * (min(max(row / max(rows - 1, 1), 0.0), 1.0) - 0.5))
     reference_ns = camera.reference_ns(device_ns + row_ns)
     return MarkerRow(camera, reference_ns, boot_id, sequence, device_ns, detection, (x, y), noise)
 

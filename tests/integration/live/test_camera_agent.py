@@ -108,6 +108,7 @@ def test_pose_and_intrinsics_of_the_rig_file_are_in_the_camera_info() -> None:
         position=np.array([1.0, 2.0, 3.0]),
         rotation=rotation,
         position_std=np.full(3, 0.01),
+        focal_std=0.1,
     )
     agent = CameraAgent(ListedDevice([0]), ScriptedDetector(), MemoryBus(hub), "cam0", known=known, target="light")
     agent.run(threading.Event())
@@ -119,6 +120,7 @@ def test_pose_and_intrinsics_of_the_rig_file_are_in_the_camera_info() -> None:
     assert not info.rotation_std
     assert list(info.matrix) == lens.matrix.ravel().tolist()
     assert list(info.distortions) == lens.distortions.tolist()
+    assert info.focal_std == 0.1
 
 
 def test_it_is_announced_while_it_runs_and_stops_on_request() -> None:

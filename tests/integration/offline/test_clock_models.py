@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from hub.calibration.pipeline import calibrate
+from protocols.geometry.camera import Intrinsics
 from protocols.session.observations import Observations
 from tests.bench.clock_models import World, reported, session
 from tests.unit.hub.bundle.test_timestamp_jitter import jittery
@@ -21,6 +23,8 @@ FAST = replace(USUAL, fps=(10.0, 12.0, 10.0, 15.0), fastest=2.5)
         ("readout+jitter5", USUAL),  # the estimated frame times took the readout up
         ("readout+jitter5", replace(USUAL, fps=FAST.fps)),
         ("readouts", FAST),  # were jitter
+        ("reversed", USUAL),  # other cameras had readouts, or clocks whose rate changes
+        ("readouts+reversed", USUAL),
         ("step15", FAST),  # residuals that change sign from frame to frame were taken for white
         ("step30+jitter10", FAST),
         ("jitter20", replace(USUAL, focal_error=0.01)),
@@ -39,6 +43,30 @@ def test_what_a_clock_does_is_reported_and_nothing_else(effect: str, world: Worl
             assert abs(estimate - size) < 4.0 * std < 0.02
         assert (said.jitter > 1e-4) == (true.jitter > 0.0)
         assert said.readout == pytest.approx(true.readout, abs=4.5 * said.readout_std)
+        assert said.readout_std < 0.003
+
+
+def test_the_readout_of_a_portrait_picture_runs_along_its_columns() -> None:
+    """It was taken for clocks whose rate changes, and lags were 2 ms off."""
+    rig, observations, clocks = session(7001, "readouts", USUAL)
+    cameras, tracks = {}, {}
+    for name, camera in rig.cameras.items():  # held upright and turned by 90°: (u, v) is now (h - 1 - v, u)
+        lens, height = camera.intrinsics, camera.size[1]
+        assert lens is not None
+        (fx, _, cx), (_, fy, cy), _ = lens.matrix
+        k1, k2, p1, p2, k3 = lens.distortions
+        matrix = np.array([[fy, 0.0, height - 1 - cy], [0.0, fx, cx], [0.0, 0.0, 1.0]])
+        turned = Intrinsics(height, camera.size[0], matrix, np.array([k1, k2, p2, -p1, k3]))
+        cameras[name] = replace(camera, size=(height, camera.size[0]), intrinsics=turned)
+        for track in observations.of_camera(name):
+            pixels = np.column_stack([height - 1 - track.pixels[:, 1], track.pixels[:, 0]])
+            tracks[name, track.label] = replace(track, pixels=pixels)
+    found = calibrate(replace(rig, cameras=cameras), Observations(tracks))
+    for name, true in clocks.items():
+        said = reported(found, name, clocks)
+        assert said is not None
+        assert abs(said.lag_z) < 4.0
+        assert said.readout == pytest.approx(-true.readout, abs=4.5 * said.readout_std)
         assert said.readout_std < 0.003
 
 

@@ -63,7 +63,8 @@ def test_colmap_gets_its_models_pixels_and_quaternions(
     angle = 2 * np.arctan2(np.linalg.norm(xyz), w)
     turn = np.array(xyz) / np.linalg.norm(xyz) * angle
     np.testing.assert_allclose(so3.exp(turn), so3.exp(np.array(tables["cam0"]["rotation"])), atol=1e-12)
-    np.testing.assert_allclose([float(word) for word in image[5:8]], tables["cam0"]["translation"], atol=1e-12)
+    metres = 0.01 * np.array(tables["cam0"]["translation"])
+    np.testing.assert_allclose([float(word) for word in image[5:8]], metres, atol=1e-12)
 
 
 def test_a_trajectory_becomes_trc_with_empty_gaps(tmp_path: Path) -> None:

@@ -74,17 +74,16 @@ NAMES = {
     "opencv": "yml",
     "kalibr": "camchain.yaml",
     "colmap": "model",
+    "opensfm": "reconstruction.json",
 }
-TIMELESS = ("colmap",)
-UNITLESS = ("colmap",)
+TIMELESS = ("colmap", "opensfm")
 
 
 @pytest.mark.parametrize("to", NAMES)
 def test_a_calibration_comes_back_as_it_went(to: str, calibration: Path, tmp_path: Path) -> None:
     out, again = tmp_path / NAMES[to], tmp_path / "again.toml"
     export(calibration, to, out)
-    units = ["--units", "cm"] if to in UNITLESS else []
-    assert run(["import", str(out), "--out", str(again), *units]) == 0
+    assert run(["import", str(out), "--out", str(again)]) == 0
     (rig, before), (rig_again, after) = read_calibration(calibration), read_calibration(again)
     assert list(after) == list(before)
     metres = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -186,7 +185,7 @@ def test_colmap_projects_as_we_do(calibration: Path, tmp_path: Path) -> None:
     for image in model.images.values():
         name = image.name.removesuffix(".png")
         points = in_front(calibration, name)
-        local = np.array([image.cam_from_world() * point for point in points])
+        local = np.array([image.cam_from_world() * (0.01 * point) for point in points])  # metres
         theirs = np.array([image.camera.img_from_cam(point) for point in local]).reshape(-1, 2)
         np.testing.assert_allclose(theirs - 0.5, project(calibration, points)[name], atol=1e-6)
 
@@ -196,11 +195,11 @@ def test_colmap_writes_what_we_read(calibration: Path, tmp_path: Path) -> None:
     model = pycolmap.Reconstruction(str(export(calibration, "colmap", tmp_path / "model")))
     (tmp_path / "theirs").mkdir()
     model.write_text(str(tmp_path / "theirs"))
-    assert run(["import", str(tmp_path / "theirs"), "--out", str(tmp_path / "b.toml"), "--units", "cm"]) == 0
+    assert run(["import", str(tmp_path / "theirs"), "--out", str(tmp_path / "b.toml")]) == 0
     (_, before), (_, after) = read_calibration(calibration), read_calibration(tmp_path / "b.toml")
     assert set(after) == set(before)
     for name, was in before.items():
-        np.testing.assert_allclose(after[name].pose.position, was.pose.position, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(100.0 * after[name].pose.position, was.pose.position, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(after[name].intrinsics.matrix, was.intrinsics.matrix, rtol=1e-12)
 
 
@@ -386,7 +385,9 @@ def test_frames_get_the_videos_own_times(tmp_path: Path) -> None:
 
 def test_a_session_becomes_a_log_and_a_session_again(tmp_path: Path) -> None:
     assert run(["simulate", "marker", "--seconds", "2", "--cameras", "2", "--out", str(tmp_path / "s")]) == 0
-    text = (tmp_path / "s" / "rig.toml").read_text()
+    text = (
+        (tmp_path / "s" / "rig.toml").read_text().replace("fps = 30.0", "fps = 30.0\nreadout = -0.012\nfocal_std = 0.1")
+    )
     (tmp_path / "s" / "rig.toml").write_text(text + "\n[metadata.more]\nx = 1\n" if "[metadata]" not in text else text)
     log, again = tmp_path / "s.mcap", tmp_path / "again"
     assert run(["import", str(tmp_path / "s"), "--out", str(log)]) == 0
@@ -395,7 +396,7 @@ def test_a_session_becomes_a_log_and_a_session_again(tmp_path: Path) -> None:
     assert list(rig_again.cameras) == list(rig.cameras)
     for name, was in rig.cameras.items():
         now = rig_again.cameras[name]
-        assert (now.size, now.fps) == (was.size, was.fps)
+        assert (now.size, now.fps, now.readout, now.focal_std) == (was.size, was.fps, -0.012, 0.1)
         assert was.intrinsics is not None and now.intrinsics is not None  # noqa: PT018
         np.testing.assert_array_equal(now.intrinsics.matrix, was.intrinsics.matrix)
         np.testing.assert_array_equal(now.intrinsics.distortions, was.intrinsics.distortions)

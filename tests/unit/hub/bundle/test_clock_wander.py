@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from hub.bundle.noise.clock_wander import fit_wander
-from hub.bundle.noise.timestamp_jitter import _is_path_held
+from hub.bundle.noise.clock_wander import Wander, fit_wander
+from hub.bundle.noise.timestamp_jitter import _FrameRows, _is_path_held, _wanders
 from hub.bundle.problem import AdjustmentState, CameraState, Problem, TrackObservations
 from hub.calibration.incremental import update_calibration
 from hub.calibration.pipeline import calibrate
@@ -47,6 +47,18 @@ def test_a_slew_is_followed_within_its_noise_and_agrees_with_the_clock_at_the_in
     assert np.abs(off - np.polyval(np.polyfit(time, off, 1), time)).max() < 1e-3
     assert abs(np.polyfit(time, off, 1)[0]) < 3.0 * found.rate_std < 2e-4
     assert 2e-5 < found.std < 3e-4
+
+
+def test_a_clock_that_was_known_to_wander_is_even_once_nothing_is_gained() -> None:
+    """It remained in the answer, "off by up to 4.7e-07 ms"."""
+    random, stamp = np.random.default_rng(3), np.linspace(0.0, 60.0, 900)
+    rows = _FrameRows(np.arange(900), stamp, np.zeros((900, 2)), random.normal(size=(900, 2)), np.full((900, 2), 300.0))
+    camera = CameraState(Intrinsics(640, 480, np.eye(3)), Pose.identity(), 1.0, 0.0, 0.0)
+    state, known = (
+        AdjustmentState((camera,), (), np.ones(1)),
+        {0: Wander(0, 30.0, stamp[:2], np.zeros(2), 9.0, 0.0, 0.0)},
+    )
+    assert _wanders([rows], state, np.zeros(1), np.array([30.0]), known, further=False) == {}
 
 
 @pytest.mark.parametrize("seed", [9103, 9105])

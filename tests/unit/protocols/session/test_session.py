@@ -82,3 +82,14 @@ def test_times_that_are_frame_numbers_are_named() -> None:
     rig = {name: {"size": [640, 480], "fps": 25.0} for name in ("CVLab1", "CVLab2")}
     [warning] = Session.from_table(rig, table).warnings
     assert warning.startswith("CVLab1: all its times are whole numbers")
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("milliseconds", 1e3), ("nanoseconds", 1e9)])
+def test_times_in_another_unit_are_named(unit: str, factor: float) -> None:
+    """The solver took two minutes for "no alignment of the two tracks agrees with any geometry"."""
+    names, often = ["a"] * 20 + ["b"] * 20, np.arange(20) / 30.0
+    table = {"camera": names, "frame": np.tile(np.arange(20), 2), "u": np.full(40, 9.0), "v": np.full(40, 9.0)}
+    rig = {name: {"size": [640, 480], "fps": 30.0} for name in ("a", "b")}
+    Session.from_table(rig, table | {"time": np.r_[often, 20.0 * np.arange(20)]})  # labelled by hand, now and then
+    with pytest.raises(InputError, match=f"b: its times are {unit}: .* divide them by "):
+        Session.from_table(rig, table | {"time": np.r_[often, factor * often]})
