@@ -14,7 +14,9 @@ from deploy.offline.track_log import open_recording
 from edge.uav.base import Telemetry
 from edge.uav.timing.ground_motion import GroundMotion, RelativeRotations, compare_ways
 from edge.uav.timing.telemetry_offset import (
+    OffsetEstimate,
     OffsetSearch,
+    accepted_offset,
     find_offset,
     search_offset,
     turned_about_axis,
@@ -130,8 +132,9 @@ def check_attitudes(
     lens: Intrinsics,
     body_from_camera: Floats,
     progress: Callable[[int], None] | None = None,
-) -> list[str]:
-    """A warning where attitudes on the video's clock turn otherwise than its images.
+) -> tuple[tuple[Telemetry, ...], list[str]]:
+    """Samples near the video's clock, on that clock where the offset is observable, and a warning where attitudes turn
+    otherwise than the images.
 
     Raises InputError where another convention of quaternions or mounting explains what the images show.
     """
@@ -149,8 +152,12 @@ def check_attitudes(
         return out
 
     given, motion = search([(recorded.samples, body_from_camera)])[0]  # none where its camera looks at the sky
+    samples, found = recorded.samples, None if given is None else accepted_offset(given)
+    if isinstance(found, OffsetEstimate):
+        # The tracker finds it in flight, too, but its ground frame begins before.
+        samples = tuple(replace(sample, time=sample.time - found.offset) for sample in samples)
     if given is not None and given.evidence >= given.threshold:
-        return _check_motion(motion, file)
+        return samples, _check_motion(motion, file)
     least = 0.0 if given is None else given.evidence
     others = search([read(recorded.samples, body_from_camera) for read in _CONVENTIONS.values()])
     fits = {
@@ -163,9 +170,10 @@ def check_attitudes(
         remedy = "give qw,qx,qy,qz of ned_from_body and body_from_camera; body axes are forward, right, down"
         raise InputError(what, file=file, remedy=remedy)
     if given is None or not given.contradicts:
-        return _check_motion(motion, file)
+        return samples, _check_motion(motion, file)
     turn = f"its attitudes turn by {math.degrees(given.telemetry_rms):.1f} degrees rms, but not as the video does"
-    return [f"{file}: {turn}: check body_from_camera in --rig, and that both are of one flight and on one clock"]
+    remedy = "check body_from_camera in --rig, and that both are of one flight and on one clock"
+    return samples, [f"{file}: {turn}: {remedy}"]
 
 
 def _check_motion(motion: GroundMotion | None, file: Path) -> list[str]:

@@ -15,6 +15,7 @@ import numpy as np
 from edge.devices.base import Frame
 from edge.devices.playback.video_reader import image_files
 from edge.uav.base import Basis, Box, Estimate, Telemetry, Tracker, TrackState
+from edge.uav.georeference import Georeference
 from edge.uav.navigation import interpolate_positions
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
@@ -153,12 +154,14 @@ def track_recording(
     *,
     start: int = 0,
     telemetry: Sequence[Telemetry] = (),
+    georeference: Georeference | None = None,
     show: Callable[[Image, TrackedFrame], object] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[TrackedFrame]:
     """Run a tracker over an opened recording, from frame ``start`` on.
 
-    show: called with every image and its estimate. progress: called with the index of every decoded frame.
+    georeference: corrects positions to the telemetry's frame. show: called with every image and its estimate.
+    progress: called with the index of every decoded frame.
     Raises InputError if the recording ends before ``start``, and the tracker's errors about the target.
     """
     waiting = iter(telemetry)
@@ -174,11 +177,15 @@ def track_recording(
         if count >= start:
             while sample is not None and sample.time <= time + _TELEMETRY_LOOKAHEAD_S:
                 tracker.handle_telemetry(sample)
+                if georeference is not None:
+                    georeference.add(sample)
                 sample = next(waiting, None)
             if count == start:
                 estimate = tracker.begin(frame.image, time, target)
             else:
                 estimate = tracker.handle_frame(frame.image, time)
+            if georeference is not None:
+                estimate = georeference.corrected(estimate, time)
             tracked = TrackedFrame(count, time, estimate)
             if show is not None:
                 show(frame.image, tracked)

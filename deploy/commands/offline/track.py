@@ -99,6 +99,7 @@ def track(
     from deploy.offline.track_overlay import draw
     from edge.devices.playback.video_writer import video_writer
     from edge.uav import tracker_factory
+    from edge.uav.georeference import Georeference
 
     for name, kind in ((tracking.TRACK, "a table"), (tracking.HYPOTHESES, "a table"), (tracking.OVERLAY, "a video")):
         check_file(out / name, kind, video, telemetry, csv_truth)
@@ -140,6 +141,7 @@ def track(
             box,
             start=start,
             telemetry=samples,
+            georeference=None if lens is None or mounting is None else Georeference(lens, mounting),
             show=None if write is None else lambda image, tracked: write(draw(image, tracked)),
             progress=frame_done,
         ):
@@ -217,7 +219,8 @@ def _samples(
         if flight.lens is not None and flight.mounting is not None:
             with _watched("comparing the telemetry with", flight, quiet) as done:
                 given = flight.video, flight.rate, flight.lens, flight.mounting
-                warnings += check_attitudes(recorded, telemetry, *given, done)
+                samples, found = check_attitudes(recorded, telemetry, *given, done)
+            warnings += found
     elif isinstance(recording, LoggedFlightImages) and telemetry.resolve() == flight.video.resolve():
         # The agent has already put both on one clock.
         samples = tuple(replace(sample, time=sample.time - recording.first_s) for sample in samples)
