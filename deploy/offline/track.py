@@ -16,10 +16,14 @@ from edge.devices.base import Frame
 from edge.devices.playback.video_reader import image_files
 from edge.uav.base import Basis, Box, Estimate, Telemetry, Tracker, TrackState
 from edge.uav.georeference import Georeference
+from edge.uav.ground.image_plane import ImagePlane
+from edge.uav.ground.localisation import frame_from_telemetry
 from edge.uav.navigation import interpolate_positions
+from edge.uav.timing.telemetry_track import TelemetryTrack
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry import so3
+from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Image
 from protocols.session.csv_table import read_csv_table
 from protocols.session.rig import RigCamera, read_rig
@@ -135,6 +139,18 @@ def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) 
     if not 1.0 < empty < math.inf:
         return []
     return [f"{file}: no sample for {empty:.1f} s of the video: {shown}; {remedy}, in seconds"]
+
+
+def positions_fit(
+    lens: Intrinsics, mounting: Floats, samples: Sequence[Telemetry], first: TrackedFrame, target: Box
+) -> bool:
+    """Whether the target of the first frame has a plausible length by the telemetry's positions, or no place at all."""
+    track = TelemetryTrack(mounting)
+    for sample in samples:
+        if sample.time <= first.time + _TELEMETRY_LOOKAHEAD_S:
+            track.add(sample)
+    frame = frame_from_telemetry(ImagePlane((lens.width, lens.height), lens), track, first.time, target)
+    return frame is None or frame.kind == "metric"
 
 
 def count_frames(video: Path) -> int:

@@ -164,8 +164,13 @@ def track(
         and any(sample.position is not None for sample in samples)
         and not any(math.isfinite(row.estimate.north) for row in rows)
     ):
-        needs = "metres, down the negative height above the ground, at which the target is 1.2 to 30 m long"
-        warnings.append(f"{telemetry}: its positions were used in no frame: they must be north, east, down in {needs}")
+        why = "the images show no plane that the target moves on, or it is near the horizon"
+        assert lens is not None  # else the telemetry is refused
+        assert mounting is not None
+        if not tracking.positions_fit(lens, mounting, samples, rows[0], box):
+            needs = "metres, down the negative height above the ground, at which the target is 0.3 to 30 m long"
+            why = f"they must be north, east, down in {needs}"
+        warnings.append(f"{telemetry}: its positions were used in no frame: {why}")
     if isinstance(recording, LoggedFlightImages) and recording.damage:
         warnings.append(f"{video}: damaged: {recording.damage}; only its intact part was tracked")
     if recording.repaired:

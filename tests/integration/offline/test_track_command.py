@@ -254,6 +254,18 @@ def test_telemetry_on_another_clock_or_in_other_units_is_named(
     assert warning in printed
 
 
+def test_good_positions_of_a_flat_view_are_not_said_to_be_in_other_units(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Within the first second of a view 50 degrees from straight down, the ground is not trusted yet."""
+    lines = [f"{k / 10},{np.cos(0.44)},0,{np.sin(0.44)},0,0,0,-30" for k in range(60)]
+    (tmp_path / "t.csv").write_text("\n".join(["time,qw,qx,qy,qz,north,east,down", *lines]) + "\n")
+    extra = ["--rig", str(recording / "rig.toml"), "--telemetry", str(tmp_path / "t.csv"), "--start", "30"]
+    out = ["--target", "272,118,36,16", "--out", str(tmp_path / "out")]
+    assert run(["track", str(recording / "pictures"), *out, *extra]) == 0
+    assert "used in no frame: the images show no plane" in capsys.readouterr().out
+
+
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flight")
