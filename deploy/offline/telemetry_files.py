@@ -30,6 +30,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TELEMETRY
 
 _MAX_ALIGNMENT_FRAMES = 3600  # two minutes at 30 Hz are enough to estimate the offset
+_MAX_OTHERS = 8  # vehicles and boots of a log that are tried, each at the cost of tracking corners in the video
 _MARGIN_S = 3.0  # duration of samples kept before and after the video
 
 _Reading = tuple[Sequence[Telemetry], Floats]
@@ -72,8 +73,8 @@ def read_telemetry_log(file: Path) -> TelemetryFile:
     if file.suffix.lower() == ".tlog":
         from edge.mavlink.link.tlog import read_tlog
 
-        log = read_tlog(file)
-        return TelemetryFile(log.samples, log.left_out)
+        first, *more = read_tlog(file)
+        return TelemetryFile(first.samples, first.left_out, others=tuple(log.samples for log in more))
     from edge.uav.navigation import rotation_from_quaternion
     from protocols.log.read.reader import LogReader
 
@@ -91,8 +92,8 @@ def read_telemetry_log(file: Path) -> TelemetryFile:
         samples.append(Telemetry(time, turned, np.array(message.position) if message.position else None))
     if not found:
         raise InputError("no telemetry in this log", file=file, remedy="record a UAV agent, or give a telemetry.csv")
-    longest = sorted(found.values(), key=len)[-1]
-    return TelemetryFile(tuple(longest), left_out)
+    longest, *others = sorted(map(tuple, found.values()), key=len, reverse=True)
+    return TelemetryFile(longest, left_out, others=tuple(others))
 
 
 def align_to_video(
@@ -109,9 +110,17 @@ def align_to_video(
     No samples if the offset can't be estimated; a warning gives the reason. progress: called with each frame's index.
     Raises InputError where the positions are wrong.
     """
-    samples = recorded.samples
-    (rotations,), time = _visual_rotations(video, fps, lens, [(samples, body_from_camera)], progress)
-    offset = find_offset(rotations, samples, body_from_camera)
+    offset: OffsetEstimate | str = ""
+    # The images are read once more only for a log whose first series is not of this video.
+    for series in ([recorded.samples], recorded.others[:_MAX_OTHERS]):
+        readings: list[_Reading] = [(samples, body_from_camera) for samples in series]
+        rotations, time = _visual_rotations(video, fps, lens, readings, progress) if readings else ([], math.inf)
+        found = [(find_offset(seen, *reading), reading[0]) for seen, reading in zip(rotations, readings, strict=True)]
+        fits = [(one.agreement, k) for k, (one, _) in enumerate(found) if isinstance(one, OffsetEstimate)]
+        if fits or not offset:
+            offset, samples = found[max(fits)[1] if fits else 0]
+        if fits:
+            break
     if isinstance(offset, str):
         return (), [f"the telemetry is not used, its clock offset against the video's is not observable: {offset}"]
     # Where the video is longer than the frames used for alignment, all later samples are kept.

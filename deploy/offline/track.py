@@ -56,11 +56,12 @@ class TrackedFrame:
 @dataclass(frozen=True, slots=True, eq=False)
 class TelemetryFile:
     """Telemetry samples in strictly increasing time. left_out: discarded rows (NaN, no rotation, repeated time).
-    back: rows of an earlier time than the row above."""
+    back: rows of an earlier time than the row above. others: of a log, the samples of other vehicles and boots."""
 
     samples: tuple[Telemetry, ...]
     left_out: int
     back: int = 0
+    others: tuple[tuple[Telemetry, ...], ...] = ()
 
 
 def parse_target(text: str) -> Box:

@@ -358,12 +358,19 @@ def test_positions_do_not_suffer_from_the_offset_of_the_telemetry(flight: Path, 
     assert error < 3.0 * std
 
 
-@pytest.mark.parametrize("above_m", [0.0, 30.0])
+@pytest.mark.parametrize(("above_m", "others"), [(0.0, 0), (30.0, 0), (0.0, 1000)])
 def test_a_log_whose_heights_are_not_above_the_ground_is_named(
-    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], above_m: float
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], above_m: float, others: int
 ) -> None:
-    """The local frame alone, which began 30 m lower: the target was 22 m off, with a std of 0.2 m."""
-    codec, data = mavlink.MAVLink(None, 1, 1), bytearray()
+    """The local frame alone, which began 30 m lower: the target was 22 m off, with a std of 0.2 m.
+
+    others: attitudes of a second vehicle. Of several, the one with the most attitudes was taken for the video's.
+    """
+    codec, data = mavlink.MAVLink(None, 2, 1), bytearray()
+    for k in range(others):
+        message = mavlink.MAVLink_attitude_message(50 * k, 0.2 * np.sin(0.1 * k), 0.1 * np.cos(0.17 * k), 0, 0, 0, 0)
+        data += k.to_bytes(8, "big") + message.pack(codec)
+    codec = mavlink.MAVLink(None, 1, 1)
     for time, *q, north, east, down in np.loadtxt(flight / "telemetry.csv", delimiter=",", skiprows=1):
         boot_ms = round(1e3 * (time + 100.0))
         for message in (
