@@ -68,8 +68,11 @@ _CONVENTIONS: dict[str, Callable[[Sequence[Telemetry], Floats], _Reading]] = {
 }
 
 
-def read_telemetry_log(file: Path) -> TelemetryFile:
-    """Read the samples of a .tlog or .mcap, on that file's own clock. Raises InputError."""
+def read_telemetry_log(file: Path, source: tuple[str, str] | None = None) -> TelemetryFile:
+    """Read the samples of a .tlog or .mcap, on that file's own clock. Raises InputError.
+
+    source: the agent and its boot in a .mcap whose samples are wanted; None: of those with the most.
+    """
     if file.suffix.lower() == ".tlog":
         from edge.mavlink.link.tlog import read_tlog
 
@@ -78,12 +81,15 @@ def read_telemetry_log(file: Path) -> TelemetryFile:
     from edge.uav.navigation import rotation_from_quaternion
     from protocols.log.read.reader import LogReader
 
-    found: dict[str, list[Telemetry]] = {}
+    found: dict[tuple[str, str], list[Telemetry]] = {}
     left_out = 0
     for logged in LogReader(file).messages([TELEMETRY]):
         message = logged.message
         assert isinstance(message, pb.VehicleTelemetry)
-        samples = found.setdefault(f"{message.agent} {message.boot_id}", [])
+        name = message.agent, message.boot_id
+        if source not in (None, name):
+            continue
+        samples = found.setdefault(name, [])
         turned = rotation_from_quaternion(list(message.ned_from_body))
         time = message.device_time_ns / NANOSECONDS
         if turned is None or (samples and time <= samples[-1].time):
@@ -91,7 +97,10 @@ def read_telemetry_log(file: Path) -> TelemetryFile:
             continue
         samples.append(Telemetry(time, turned, np.array(message.position) if message.position else None))
     if not found:
-        raise InputError("no telemetry in this log", file=file, remedy="record a UAV agent, or give a telemetry.csv")
+        of = "" if source is None else f" of the run of {source[0]} that has the images"
+        raise InputError(
+            f"no telemetry{of} in this log", file=file, remedy="record a UAV agent, or give a telemetry.csv"
+        )
     longest, *others = sorted(map(tuple, found.values()), key=len, reverse=True)
     return TelemetryFile(longest, left_out, others=tuple(others))
 

@@ -208,7 +208,9 @@ def _samples(
 
     recording, count, warnings = flight.recording, flight.frames, []
     own_clock = telemetry.suffix.lower() in (".tlog", ".mcap")
-    recorded = read_telemetry_log(telemetry) if own_clock else tracking.read_telemetry(telemetry)
+    logged = isinstance(recording, LoggedFlightImages) and telemetry.resolve() == flight.video.resolve()
+    source = recording.source if logged else None
+    recorded = read_telemetry_log(telemetry, source) if own_clock else tracking.read_telemetry(telemetry)
     if needs_lens and (flight.lens is None or flight.mounting is None):
         what = "telemetry cannot be used without the camera's matrix and body_from_camera"
         raise InputError(what, file=telemetry, remedy="give both in --rig, or leave --telemetry out")
@@ -226,7 +228,7 @@ def _samples(
                 given = flight.video, flight.rate, flight.lens, flight.mounting
                 samples, found = check_attitudes(recorded, telemetry, *given, done)
             warnings += found
-    elif isinstance(recording, LoggedFlightImages) and telemetry.resolve() == flight.video.resolve():
+    elif logged:
         # The agent has already put both on one clock.
         samples = tuple(replace(sample, time=sample.time - recording.first_s) for sample in samples)
     elif flight.lens is None or flight.mounting is None:

@@ -14,8 +14,12 @@ import pytest
 from deploy.cli import run
 from deploy.simulation.flight import write_simulated_flight
 from edge.mavlink.dialect import mavlink
+from protocols.core.jpeg import encode_jpeg
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
+from protocols.log.write.writer import LogWriter
+from protocols.messages import syncline_pb2 as pb
+from protocols.topics import FLIGHT_IMAGE, TELEMETRY
 from tests.support.videos import write_video
 
 SIZE = (320, 240)
@@ -384,6 +388,31 @@ def test_a_log_whose_heights_are_not_above_the_ground_is_named(
     printed = capsys.readouterr().out
     assert "is not used" not in printed
     assert ("not above sea level" in printed) == (above_m > 0.0)
+
+
+@pytest.mark.parametrize("of_its_own", [True, False])
+def test_of_a_log_of_two_vehicles_the_telemetry_is_that_of_the_images(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], of_its_own: bool
+) -> None:
+    """It was that of the vehicle with more of it, 500 m away."""
+    level = {"schema_version": 1, "boot_id": "b", "time_std_s": 0.01, "ned_from_body": [1.0, 0.0, 0.0, 0.0]}
+    with LogWriter(tmp_path / "a.mcap") as log:
+        for k, file in enumerate(sorted((recording / "pictures").iterdir())[:20]):
+            moment = {"device_time_ns": k * 50_000_000, "order": 4 * k}
+            image = {"frame": k, "width": 320, "height": 240, "jpeg": encode_jpeg(cv2.imread(str(file)), 95)}
+            picture = pb.FlightImage(schema_version=1, agent="one", boot_id="b", **moment, **image)
+            log.write(FLIGHT_IMAGE, "one", "site", picture, k)
+            for agent, north in (("one", 0.0), ("two", 500.0), ("two", 500.0))[not of_its_own :]:
+                moment = {"device_time_ns": moment["device_time_ns"] + 1_000_000, "order": moment["order"] + 1}
+                sample = pb.VehicleTelemetry(agent=agent, position=[north, 0.0, -30.0], **moment, **level)
+                log.write(TELEMETRY, agent, "site", sample, k)
+    log_file = str(tmp_path / "a.mcap")
+    extra = ["--rig", str(recording / "rig.toml"), "--telemetry", log_file, "--out", str(tmp_path / "out")]
+    assert run(["track", log_file, "--target", TARGET, *extra]) == (0 if of_its_own else 2)
+    if of_its_own:
+        assert abs(float(table(tmp_path / "out" / "track.csv")[10]["north"])) < 10.0
+    else:
+        assert "no telemetry of the run of one that has the images" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])
