@@ -30,6 +30,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TELEMETRY
 
 _MAX_ALIGNMENT_FRAMES = 3600  # two minutes at 30 Hz are enough to estimate the offset
+_MOST_STD_S = 0.1  # of the offset of a telemetry.csv: a third of what is known of it before
 _MAX_OTHERS = 8  # vehicles and boots of a log that are tried, each at the cost of tracking corners in the video
 _MARGIN_S = 3.0  # duration of samples kept before and after the video
 
@@ -151,36 +152,46 @@ def check_attitudes(
     body_from_camera: Floats,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[tuple[Telemetry, ...], list[str]]:
-    """Samples near the video's clock, on that clock where the offset is observable, and a warning where attitudes turn
-    otherwise than the images.
+    """Samples near the video's clock, on that clock where the offset is observable, and warnings where it is large or
+    attitudes turn otherwise than the images.
 
     Raises InputError where another convention of quaternions or mounting explains what the images show.
     """
     from edge.uav.timing.telemetry_track import MAX_OFFSET_S
 
-    def search(readings: list[_Reading]) -> list[tuple[OffsetSearch | None, GroundMotion | None]]:
+    def search(readings: list[_Reading]) -> list[tuple[OffsetSearch | None, GroundMotion | None, RelativeRotations]]:
         rotations, _ = _visual_rotations(video, fps, lens, readings, progress)
         limits = -MAX_OFFSET_S, MAX_OFFSET_S
-        out: list[tuple[OffsetSearch | None, GroundMotion | None]] = []
+        out: list[tuple[OffsetSearch | None, GroundMotion | None, RelativeRotations]] = []
         for seen, reading in zip(rotations, readings, strict=True):
             found = search_offset(seen, *reading, limits)
             searched = None if isinstance(found, str) else found
             offset = 0.0 if searched is None or searched.evidence < searched.threshold else searched.offset
-            out.append((searched, compare_ways(seen, *reading, offset)))
+            out.append((searched, compare_ways(seen, *reading, offset), seen))
         return out
 
-    given, motion = search([(recorded.samples, body_from_camera)])[0]  # none where its camera looks at the sky
-    samples, found = recorded.samples, None if given is None else accepted_offset(given)
-    if isinstance(found, OffsetEstimate):
-        # The tracker finds it in flight, too, but its ground frame begins before.
-        samples = tuple(replace(sample, time=sample.time - found.offset) for sample in samples)
-    if given is not None and given.evidence >= given.threshold:
+    # None where its camera looks at the sky.
+    given, motion, seen = search([(recorded.samples, body_from_camera)])[0]
+    within = given is not None and given.evidence >= given.threshold
+    found = given if within else search_offset(seen, recorded.samples, body_from_camera)
+    offset = accepted_offset(found, None, _MOST_STD_S) if isinstance(found, OffsetSearch) else None
+    samples, notes = recorded.samples, []
+    if isinstance(offset, OffsetEstimate):
+        # The tracker finds small ones in flight, too, but its ground frame begins before.
+        samples = tuple(replace(sample, time=sample.time - offset.offset) for sample in samples)
+        if not within:
+            motion = compare_ways(seen, recorded.samples, body_from_camera, offset.offset)
+            apart = f"{abs(offset.offset):.2f} s {'later' if offset.offset > 0.0 else 'earlier'}"
+            what = f"by the rotation that both show its times are {apart} than the video's, and were corrected"
+            notes = [f"{file}: {what}: 0 is the video's first frame"]
+        return samples, [*notes, *_check_motion(motion, file)]
+    if within:
         return samples, _check_motion(motion, file)
     least = 0.0 if given is None else given.evidence
     others = search([read(recorded.samples, body_from_camera) for read in _CONVENTIONS.values()])
     fits = {
         one.evidence: name
-        for name, (one, _) in zip(_CONVENTIONS, others, strict=True)
+        for name, (one, _, _) in zip(_CONVENTIONS, others, strict=True)
         if one is not None and one.evidence > least + one.threshold
     }
     if fits:

@@ -341,10 +341,13 @@ def test_positions_that_are_no_metres_above_the_ground_are_named(
     assert named in printed.out + printed.err
 
 
-def test_positions_do_not_suffer_from_the_offset_of_the_telemetry(flight: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("late_s", [-0.25, 2.0])
+def test_positions_do_not_suffer_from_the_offset_of_the_telemetry(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], late_s: float
+) -> None:
     """The ground frame began where the vehicle was 0.2 s later, and kept it: 2 m off with stds of 0.1 m."""
     late = np.loadtxt(flight / "telemetry.csv", delimiter=",", skiprows=1)
-    late[:, 0] -= 0.25
+    late[:, 0] += late_s
     header = (flight / "telemetry.csv").read_text().splitlines()[0]
     np.savetxt(tmp_path / "t.csv", late, "%.9g", ",", header=header, comments="")
     truth = table(flight / "truth.csv")
@@ -360,6 +363,7 @@ def test_positions_do_not_suffer_from_the_offset_of_the_telemetry(flight: Path, 
     error, std = np.median(seen, axis=0)
     assert error < 1.0
     assert error < 3.0 * std
+    assert ("s later than the video's" in capsys.readouterr().out) == (late_s > 1.0)
 
 
 @pytest.mark.parametrize(("above_m", "others"), [(0.0, 0), (30.0, 0), (0.0, 1000)])
