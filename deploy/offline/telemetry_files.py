@@ -172,21 +172,21 @@ def check_attitudes(
 
     # None where its camera looks at the sky.
     given, motion, seen = search([(recorded.samples, body_from_camera)])[0]
-    within = given is not None and given.evidence >= given.threshold
-    found = given if within else search_offset(seen, recorded.samples, body_from_camera)
-    offset = accepted_offset(found, None, _MOST_STD_S) if isinstance(found, OffsetSearch) else None
+    offset = None if given is None else accepted_offset(given, None, _MOST_STD_S)
+    if not isinstance(offset, OffsetEstimate):
+        wider = search_offset(seen, recorded.samples, body_from_camera)
+        offset = None if isinstance(wider, str) else accepted_offset(wider, None, _MOST_STD_S)
     samples, notes = recorded.samples, []
     if isinstance(offset, OffsetEstimate):
         # The tracker finds small ones in flight, too, but its ground frame begins before.
         samples = tuple(replace(sample, time=sample.time - offset.offset) for sample in samples)
-        if not within:
-            motion = compare_ways(seen, recorded.samples, body_from_camera, offset.offset)
+        motion = compare_ways(seen, recorded.samples, body_from_camera, offset.offset)
+        if abs(offset.offset) > MAX_OFFSET_S:
             apart = f"{abs(offset.offset):.2f} s {'later' if offset.offset > 0.0 else 'earlier'}"
             what = f"by the rotation that both show its times are {apart} than the video's, and were corrected"
             notes = [f"{file}: {what}: 0 is the video's first frame"]
+    if isinstance(offset, OffsetEstimate) or (given is not None and given.evidence >= given.threshold):
         return samples, [*notes, *_check_motion(motion, file)]
-    if within:
-        return samples, _check_motion(motion, file)
     least = 0.0 if given is None else given.evidence
     others = search([read(recorded.samples, body_from_camera) for read in _CONVENTIONS.values()])
     fits = {

@@ -341,7 +341,7 @@ def test_positions_that_are_no_metres_above_the_ground_are_named(
     assert named in printed.out + printed.err
 
 
-@pytest.mark.parametrize("late_s", [-0.25, 2.0])
+@pytest.mark.parametrize("late_s", [-0.25, 0.5, 2.0])
 def test_positions_do_not_suffer_from_the_offset_of_the_telemetry(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], late_s: float
 ) -> None:
