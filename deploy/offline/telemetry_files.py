@@ -14,7 +14,9 @@ from deploy.offline.track_log import open_recording
 from edge.uav.base import Telemetry
 from edge.uav.timing.ground_motion import GroundMotion, RelativeRotations, compare_ways
 from edge.uav.timing.telemetry_offset import (
+    OffsetEstimate,
     OffsetSearch,
+    accepted_offset,
     find_offset,
     search_offset,
     turned_about_axis,
@@ -28,6 +30,8 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.topics import TELEMETRY
 
 _MAX_ALIGNMENT_FRAMES = 3600  # two minutes at 30 Hz are enough to estimate the offset
+_MOST_STD_S = 0.1  # of the offset of a telemetry.csv: a third of what is known of it before
+_MAX_OTHERS = 8  # vehicles and boots of a log that are tried, each at the cost of tracking corners in the video
 _MARGIN_S = 3.0  # duration of samples kept before and after the video
 
 _Reading = tuple[Sequence[Telemetry], Floats]
@@ -65,22 +69,28 @@ _CONVENTIONS: dict[str, Callable[[Sequence[Telemetry], Floats], _Reading]] = {
 }
 
 
-def read_telemetry_log(file: Path) -> TelemetryFile:
-    """Read the samples of a .tlog or .mcap, on that file's own clock. Raises InputError."""
+def read_telemetry_log(file: Path, source: tuple[str, str] | None = None) -> TelemetryFile:
+    """Read the samples of a .tlog or .mcap, on that file's own clock. Raises InputError.
+
+    source: the agent and its boot in a .mcap whose samples are wanted; None: of those with the most.
+    """
     if file.suffix.lower() == ".tlog":
         from edge.mavlink.link.tlog import read_tlog
 
-        log = read_tlog(file)
-        return TelemetryFile(log.samples, log.left_out)
+        first, *more = read_tlog(file)
+        return TelemetryFile(first.samples, first.left_out, others=tuple(log.samples for log in more))
     from edge.uav.navigation import rotation_from_quaternion
     from protocols.log.read.reader import LogReader
 
-    found: dict[str, list[Telemetry]] = {}
+    found: dict[tuple[str, str], list[Telemetry]] = {}
     left_out = 0
     for logged in LogReader(file).messages([TELEMETRY]):
         message = logged.message
         assert isinstance(message, pb.VehicleTelemetry)
-        samples = found.setdefault(f"{message.agent} {message.boot_id}", [])
+        name = message.agent, message.boot_id
+        if source not in (None, name):
+            continue
+        samples = found.setdefault(name, [])
         turned = rotation_from_quaternion(list(message.ned_from_body))
         time = message.device_time_ns / NANOSECONDS
         if turned is None or (samples and time <= samples[-1].time):
@@ -88,9 +98,12 @@ def read_telemetry_log(file: Path) -> TelemetryFile:
             continue
         samples.append(Telemetry(time, turned, np.array(message.position) if message.position else None))
     if not found:
-        raise InputError("no telemetry in this log", file=file, remedy="record a UAV agent, or give a telemetry.csv")
-    longest = sorted(found.values(), key=len)[-1]
-    return TelemetryFile(tuple(longest), left_out)
+        of = "" if source is None else f" of the run of {source[0]} that has the images"
+        raise InputError(
+            f"no telemetry{of} in this log", file=file, remedy="record a UAV agent, or give a telemetry.csv"
+        )
+    longest, *others = sorted(map(tuple, found.values()), key=len, reverse=True)
+    return TelemetryFile(longest, left_out, others=tuple(others))
 
 
 def align_to_video(
@@ -107,9 +120,17 @@ def align_to_video(
     No samples if the offset can't be estimated; a warning gives the reason. progress: called with each frame's index.
     Raises InputError where the positions are wrong.
     """
-    samples = recorded.samples
-    (rotations,), time = _visual_rotations(video, fps, lens, [(samples, body_from_camera)], progress)
-    offset = find_offset(rotations, samples, body_from_camera)
+    offset: OffsetEstimate | str = ""
+    # The images are read once more only for a log whose first series is not of this video.
+    for series in ([recorded.samples], recorded.others[:_MAX_OTHERS]):
+        readings: list[_Reading] = [(samples, body_from_camera) for samples in series]
+        rotations, time = _visual_rotations(video, fps, lens, readings, progress) if readings else ([], math.inf)
+        found = [(find_offset(seen, *reading), reading[0]) for seen, reading in zip(rotations, readings, strict=True)]
+        fits = [(one.agreement, k) for k, (one, _) in enumerate(found) if isinstance(one, OffsetEstimate)]
+        if fits or not offset:
+            offset, samples = found[max(fits)[1] if fits else 0]
+        if fits:
+            break
     if isinstance(offset, str):
         return (), [f"the telemetry is not used, its clock offset against the video's is not observable: {offset}"]
     # Where the video is longer than the frames used for alignment, all later samples are kept.
@@ -130,32 +151,47 @@ def check_attitudes(
     lens: Intrinsics,
     body_from_camera: Floats,
     progress: Callable[[int], None] | None = None,
-) -> list[str]:
-    """A warning where attitudes on the video's clock turn otherwise than its images.
+) -> tuple[tuple[Telemetry, ...], list[str]]:
+    """Samples near the video's clock, on that clock where the offset is observable, and warnings where it is large or
+    attitudes turn otherwise than the images.
 
     Raises InputError where another convention of quaternions or mounting explains what the images show.
     """
     from edge.uav.timing.telemetry_track import MAX_OFFSET_S
 
-    def search(readings: list[_Reading]) -> list[tuple[OffsetSearch | None, GroundMotion | None]]:
+    def search(readings: list[_Reading]) -> list[tuple[OffsetSearch | None, GroundMotion | None, RelativeRotations]]:
         rotations, _ = _visual_rotations(video, fps, lens, readings, progress)
         limits = -MAX_OFFSET_S, MAX_OFFSET_S
-        out: list[tuple[OffsetSearch | None, GroundMotion | None]] = []
+        out: list[tuple[OffsetSearch | None, GroundMotion | None, RelativeRotations]] = []
         for seen, reading in zip(rotations, readings, strict=True):
             found = search_offset(seen, *reading, limits)
             searched = None if isinstance(found, str) else found
             offset = 0.0 if searched is None or searched.evidence < searched.threshold else searched.offset
-            out.append((searched, compare_ways(seen, *reading, offset)))
+            out.append((searched, compare_ways(seen, *reading, offset), seen))
         return out
 
-    given, motion = search([(recorded.samples, body_from_camera)])[0]  # none where its camera looks at the sky
-    if given is not None and given.evidence >= given.threshold:
-        return _check_motion(motion, file)
+    # None where its camera looks at the sky.
+    given, motion, seen = search([(recorded.samples, body_from_camera)])[0]
+    offset = None if given is None else accepted_offset(given, None, _MOST_STD_S)
+    if not isinstance(offset, OffsetEstimate):
+        wider = search_offset(seen, recorded.samples, body_from_camera)
+        offset = None if isinstance(wider, str) else accepted_offset(wider, None, _MOST_STD_S)
+    samples, notes = recorded.samples, []
+    if isinstance(offset, OffsetEstimate):
+        # The tracker finds small ones in flight, too, but its ground frame begins before.
+        samples = tuple(replace(sample, time=sample.time - offset.offset) for sample in samples)
+        motion = compare_ways(seen, recorded.samples, body_from_camera, offset.offset)
+        if abs(offset.offset) > MAX_OFFSET_S:
+            apart = f"{abs(offset.offset):.2f} s {'later' if offset.offset > 0.0 else 'earlier'}"
+            what = f"by the rotation that both show its times are {apart} than the video's, and were corrected"
+            notes = [f"{file}: {what}: 0 is the video's first frame"]
+    if isinstance(offset, OffsetEstimate) or (given is not None and given.evidence >= given.threshold):
+        return samples, [*notes, *_check_motion(motion, file)]
     least = 0.0 if given is None else given.evidence
     others = search([read(recorded.samples, body_from_camera) for read in _CONVENTIONS.values()])
     fits = {
         one.evidence: name
-        for name, (one, _) in zip(_CONVENTIONS, others, strict=True)
+        for name, (one, _, _) in zip(_CONVENTIONS, others, strict=True)
         if one is not None and one.evidence > least + one.threshold
     }
     if fits:
@@ -163,9 +199,10 @@ def check_attitudes(
         remedy = "give qw,qx,qy,qz of ned_from_body and body_from_camera; body axes are forward, right, down"
         raise InputError(what, file=file, remedy=remedy)
     if given is None or not given.contradicts:
-        return _check_motion(motion, file)
+        return samples, _check_motion(motion, file)
     turn = f"its attitudes turn by {math.degrees(given.telemetry_rms):.1f} degrees rms, but not as the video does"
-    return [f"{file}: {turn}: check body_from_camera in --rig, and that both are of one flight and on one clock"]
+    remedy = "check body_from_camera in --rig, and that both are of one flight and on one clock"
+    return samples, [f"{file}: {turn}: {remedy}"]
 
 
 def _check_motion(motion: GroundMotion | None, file: Path) -> list[str]:

@@ -15,10 +15,15 @@ import numpy as np
 from edge.devices.base import Frame
 from edge.devices.playback.video_reader import image_files
 from edge.uav.base import Basis, Box, Estimate, Telemetry, Tracker, TrackState
+from edge.uav.georeference import Georeference
+from edge.uav.ground.image_plane import ImagePlane
+from edge.uav.ground.localisation import frame_from_telemetry
 from edge.uav.navigation import interpolate_positions
+from edge.uav.timing.telemetry_track import TelemetryTrack
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry import so3
+from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Image
 from protocols.session.csv_table import read_csv_table
 from protocols.session.rig import RigCamera, read_rig
@@ -51,11 +56,12 @@ class TrackedFrame:
 @dataclass(frozen=True, slots=True, eq=False)
 class TelemetryFile:
     """Telemetry samples in strictly increasing time. left_out: discarded rows (NaN, no rotation, repeated time).
-    back: rows of an earlier time than the row above."""
+    back: rows of an earlier time than the row above. others: of a log, the samples of other vehicles and boots."""
 
     samples: tuple[Telemetry, ...]
     left_out: int
     back: int = 0
+    others: tuple[tuple[Telemetry, ...], ...] = ()
 
 
 def parse_target(text: str) -> Box:
@@ -136,6 +142,18 @@ def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) 
     return [f"{file}: no sample for {empty:.1f} s of the video: {shown}; {remedy}, in seconds"]
 
 
+def positions_fit(
+    lens: Intrinsics, mounting: Floats, samples: Sequence[Telemetry], first: TrackedFrame, target: Box
+) -> bool:
+    """Whether the target of the first frame has a plausible length by the telemetry's positions, or no place at all."""
+    track = TelemetryTrack(mounting)
+    for sample in samples:
+        if sample.time <= first.time + _TELEMETRY_LOOKAHEAD_S:
+            track.add(sample)
+    frame = frame_from_telemetry(ImagePlane((lens.width, lens.height), lens), track, first.time, target)
+    return frame is None or frame.kind == "metric"
+
+
 def count_frames(video: Path) -> int:
     """Number of frames of a video according to its header, or of images in a folder; 0 if unknown."""
     if video.is_dir():
@@ -153,12 +171,14 @@ def track_recording(
     *,
     start: int = 0,
     telemetry: Sequence[Telemetry] = (),
+    georeference: Georeference | None = None,
     show: Callable[[Image, TrackedFrame], object] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[TrackedFrame]:
     """Run a tracker over an opened recording, from frame ``start`` on.
 
-    show: called with every image and its estimate. progress: called with the index of every decoded frame.
+    georeference: corrects positions to the telemetry's frame. show: called with every image and its estimate.
+    progress: called with the index of every decoded frame.
     Raises InputError if the recording ends before ``start``, and the tracker's errors about the target.
     """
     waiting = iter(telemetry)
@@ -174,11 +194,15 @@ def track_recording(
         if count >= start:
             while sample is not None and sample.time <= time + _TELEMETRY_LOOKAHEAD_S:
                 tracker.handle_telemetry(sample)
+                if georeference is not None:
+                    georeference.add(sample)
                 sample = next(waiting, None)
             if count == start:
                 estimate = tracker.begin(frame.image, time, target)
             else:
                 estimate = tracker.handle_frame(frame.image, time)
+            if georeference is not None:
+                estimate = georeference.corrected(estimate, time)
             tracked = TrackedFrame(count, time, estimate)
             if show is not None:
                 show(frame.image, tracked)

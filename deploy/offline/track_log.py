@@ -27,9 +27,9 @@ _FPS = 30.0  # where the log does not tell
 class LoggedFlightImages(Playback):
     """Images of the agent and boot with the most images. lens, body_from_camera: as known to that agent.
 
-    count: images in the log. damage: what is wrong with the log, or "". repaired: images that cannot be decoded, or
-    whose time does not increase. first_s: camera time of the first image [s]. Raises InputError if the log has no image
-    that can be decoded.
+    source: that agent and boot. count: images in the log. damage: what is wrong with the log, or "". repaired: images
+    that cannot be decoded, or whose time does not increase. first_s: camera time of the first image [s].
+    Raises InputError if the log has no image that can be decoded.
     """
 
     def __init__(self, log: Path, *, fps: float | None = None, intrinsics: Intrinsics | None = None) -> None:
@@ -41,12 +41,12 @@ class LoggedFlightImages(Playback):
         if not names:
             what = "this log contains no flight images"
             raise InputError(what, file=log, remedy="give the video, or record a UAV agent with [images]")
-        self._chosen, self.count = names.most_common(1)[0]
+        self.source, self.count = names.most_common(1)[0]
         self.damage = self._reader.damage
         known: pb.UavInfo | None = None
         for logged in self._reader.messages([UAV_INFO]):
             message: Any = logged.message
-            if _name(message) == self._chosen:
+            if _name(message) == self.source:
                 known = message
                 break
         self.lens = intrinsics or (None if known is None else Intrinsics.of_message(known))
@@ -66,7 +66,7 @@ class LoggedFlightImages(Playback):
         shape: tuple[int, ...] | None = None
         for logged in self._reader.messages([FLIGHT_IMAGE]):
             message: Any = logged.message
-            if _name(message) != self._chosen:
+            if _name(message) != self.source:
                 continue
             image = decode_image(message)
             if image is None or message.device_time_ns <= newest or image.shape != (shape or image.shape):

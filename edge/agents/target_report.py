@@ -49,7 +49,7 @@ def update_tracking_status(
             ray = np.array([0.0, 0.0, 1.0]) if lens is None else np.append(lens.unproject(middle)[0], 1.0)
             met = ground_point(ned_from_camera @ ray, mount.position, _LEAST_DOWN)
             if met is not None:
-                status.image_centre = origin.to_geodetic(float(met[0][0]), float(met[0][1]), 0.0)
+                status.image_centre = origin.to_geodetic(float(met[0]), float(met[1]), 0.0)
     status.centre = status.half_size = status.geo = status.velocity = None
     status.h_acc = status.distance = status.course = math.nan
     status.state = "idle" if estimate is None else estimate.state.value

@@ -21,10 +21,11 @@ _MIN_COSINE = 0.6  # between the ray and straight down: for flatter rays a small
 _ROLL_PITCH_STD_RAD = 0.005  # of an autopilot's roll and pitch
 _MIN_HEIGHT_M = 2.0  # of the camera: below, an error of the height in metres is as large as the height
 _CAR_CENTRE_HEIGHT_M = 0.7  # above the ground: 0.155 of a car's length of 4.5 m, as the ground tracker takes it
+_CENTRE_HEIGHT_STD_M = 0.7  # of that height: a person's is 0.9 m, a boat's with its mast 2 m
 
 
-def ground_point(ray: Floats, centre: Floats, least_down: float, above: float = 0.0) -> tuple[Floats, float] | None:
-    """Where a ray meets the ground: (2,) north, east [m] and its std by the attitude's [m]; None if not observable.
+def ground_point(ray: Floats, centre: Floats, least_down: float, above: float = 0.0) -> Floats | None:
+    """Where a ray meets the ground: (2,) north, east [m]; None if not observable.
 
     ray: (3,) direction NED of any length. centre: (3,) NED [m] where it starts. least_down: least cosine between the
     ray and straight down. above: height of the plane above the ground [m].
@@ -33,9 +34,14 @@ def ground_point(ray: Floats, centre: Floats, least_down: float, above: float = 
     height = -float(centre[2])
     if not (ray[2] > least_down and height > _MIN_HEIGHT_M):
         return None
-    height -= above
-    ground: Floats = centre[:2] + height / ray[2] * ray[:2]
-    return ground, _ROLL_PITCH_STD_RAD * height / float(ray[2]) ** 2
+    return np.asarray(centre[:2] + (height - above) / ray[2] * ray[:2])
+
+
+def _ground_std(place: Floats, centre: Floats) -> float:
+    """Std [m], one coordinate, of a place (2,) seen from a centre (3,), by the attitude and the target's height."""
+    height = max(-float(centre[2]), _MIN_HEIGHT_M)
+    slope = float(np.hypot(*(place - centre[:2]))) / height
+    return math.hypot(_ROLL_PITCH_STD_RAD * height * (1.0 + slope**2), _CENTRE_HEIGHT_STD_M * slope / math.sqrt(2.0))
 
 
 class Georeference:
@@ -60,8 +66,8 @@ class Georeference:
         self.offset = None
         self._last_s = -math.inf
 
-    def locate(self, x: float, y: float, time: float) -> tuple[Floats, float] | None:
-        """Ground position (2,) north, east [m] of the target at a pixel, and its std [m]; None if not observable."""
+    def locate(self, x: float, y: float, time: float) -> Floats | None:
+        """Ground position (2,) north, east [m] of the target at a pixel; None if not observable."""
         camera_from_ned, centre = self._telemetry.rotation_at(time), self._telemetry.position_at(time)
         if camera_from_ned is None or centre is None or not (math.isfinite(x) and math.isfinite(y)):
             return None
@@ -72,18 +78,18 @@ class Georeference:
         return ground_point(ray, centre, _MIN_COSINE, _CAR_CENTRE_HEIGHT_M)
 
     def corrected(self, estimate: Estimate, time: float) -> Estimate:
-        """The estimate with its position in the vehicle's frame; unchanged where its ground frame is not metric."""
+        """The estimate with its position in the vehicle's frame and the std of that, where its ground is metric."""
         if not (math.isfinite(estimate.north) and math.isfinite(estimate.east)):
             return estimate
         measured = self.locate(estimate.x, estimate.y, time)
-        in_tracker_frame = np.array([estimate.north, estimate.east])
+        place = np.array([estimate.north, estimate.east])
         if measured is not None:
-            difference = measured[0] - in_tracker_frame
+            difference = measured - place
             gain = 1.0 if self.offset is None else -math.expm1(-max(time - self._last_s, 0.0) / _TIME_CONSTANT_S)
             self.offset = difference if self.offset is None else self.offset + gain * (difference - self.offset)
         self._last_s = time
-        if self.offset is None:
-            return estimate
-        north, east = in_tracker_frame + self.offset
-        tilt_std = measured[1] if measured is not None else 0.0
-        return replace(estimate, north=float(north), east=float(east), std_m=math.hypot(estimate.std_m, tilt_std))
+        if self.offset is not None:
+            place = place + self.offset
+        centre = self._telemetry.position_at(time)
+        std_m = estimate.std_m if centre is None else math.hypot(estimate.std_m, _ground_std(place, centre))
+        return replace(estimate, north=float(place[0]), east=float(place[1]), std_m=std_m)

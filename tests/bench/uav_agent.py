@@ -109,7 +109,7 @@ def tlog(data: Path) -> bool:
     if not file.exists():
         print(f"tlog: left out, there is no {file}")
         return True
-    samples = read_tlog(file).samples
+    samples = read_tlog(file)[0].samples
     times = np.array([sample.time for sample in samples])
     from scipy.spatial.transform import Rotation, RotationSpline
 

@@ -99,6 +99,7 @@ def track(
     from deploy.offline.track_overlay import draw
     from edge.devices.playback.video_writer import video_writer
     from edge.uav import tracker_factory
+    from edge.uav.georeference import Georeference
 
     for name, kind in ((tracking.TRACK, "a table"), (tracking.HYPOTHESES, "a table"), (tracking.OVERLAY, "a video")):
         check_file(out / name, kind, video, telemetry, csv_truth)
@@ -140,6 +141,7 @@ def track(
             box,
             start=start,
             telemetry=samples,
+            georeference=None if lens is None or mounting is None else Georeference(lens, mounting),
             show=None if write is None else lambda image, tracked: write(draw(image, tracked)),
             progress=frame_done,
         ):
@@ -162,8 +164,13 @@ def track(
         and any(sample.position is not None for sample in samples)
         and not any(math.isfinite(row.estimate.north) for row in rows)
     ):
-        needs = "metres, down the negative height above the ground, at which the target is 1.2 to 30 m long"
-        warnings.append(f"{telemetry}: its positions were used in no frame: they must be north, east, down in {needs}")
+        why = "the images show no plane that the target moves on, or it is near the horizon"
+        assert lens is not None  # else the telemetry is refused
+        assert mounting is not None
+        if not tracking.positions_fit(lens, mounting, samples, rows[0], box):
+            needs = "metres, down the negative height above the ground, at which the target is 0.3 to 30 m long"
+            why = f"they must be north, east, down in {needs}"
+        warnings.append(f"{telemetry}: its positions were used in no frame: {why}")
     if isinstance(recording, LoggedFlightImages) and recording.damage:
         warnings.append(f"{video}: damaged: {recording.damage}; only its intact part was tracked")
     if recording.repaired:
@@ -201,7 +208,9 @@ def _samples(
 
     recording, count, warnings = flight.recording, flight.frames, []
     own_clock = telemetry.suffix.lower() in (".tlog", ".mcap")
-    recorded = read_telemetry_log(telemetry) if own_clock else tracking.read_telemetry(telemetry)
+    logged = isinstance(recording, LoggedFlightImages) and telemetry.resolve() == flight.video.resolve()
+    source = recording.source if logged else None
+    recorded = read_telemetry_log(telemetry, source) if own_clock else tracking.read_telemetry(telemetry)
     if needs_lens and (flight.lens is None or flight.mounting is None):
         what = "telemetry cannot be used without the camera's matrix and body_from_camera"
         raise InputError(what, file=telemetry, remedy="give both in --rig, or leave --telemetry out")
@@ -217,8 +226,9 @@ def _samples(
         if flight.lens is not None and flight.mounting is not None:
             with _watched("comparing the telemetry with", flight, quiet) as done:
                 given = flight.video, flight.rate, flight.lens, flight.mounting
-                warnings += check_attitudes(recorded, telemetry, *given, done)
-    elif isinstance(recording, LoggedFlightImages) and telemetry.resolve() == flight.video.resolve():
+                samples, found = check_attitudes(recorded, telemetry, *given, done)
+            warnings += found
+    elif logged:
         # The agent has already put both on one clock.
         samples = tuple(replace(sample, time=sample.time - recording.first_s) for sample in samples)
     elif flight.lens is None or flight.mounting is None:

@@ -22,6 +22,7 @@ CAR_LENGTH = 4.5
 _MIN_LENGTH, _MAX_LENGTH = 0.3, 30.0  # of a plausible target [m]: a person from above is 0.5 m
 _MIN_HEIGHT = 2.0  # of the camera for a plausible position [m]
 _MAX_RANGE_RATIO = 12.0  # horizontal distance over height: beyond, the target is near the horizon
+_GAP_S = 0.25  # between images, from which the way of before is no prediction: at 1 g it is 0.3 m wrong
 _CONVERGED_STD_S = 0.04  # of the clock offset, for which telemetry is used
 _ATTITUDE_STD = np.deg2rad(1.0)  # of the absolute attitude as a measurement, per frame
 _POSITION_STD = np.array([4.0, 4.0, 2.0])  # [m]; with less, drift of the receiver would appear as speed of the target
@@ -192,7 +193,8 @@ class CameraLocaliser:
         predicted: PlanePose | None = None
         attitude: tuple[Floats, Floats] | None = None
         position: tuple[Floats, Floats] | None = None
-        if telemetry is not None and isinstance(pose, PlanePose) and telemetry.offset_std < 0.1:
+        gap = dt > _GAP_S  # whatever the offset, what changed meanwhile is better known by telemetry
+        if telemetry is not None and isinstance(pose, PlanePose) and (telemetry.offset_std < 0.1 or gap):
             measured = telemetry.rotation_at(time)
             if measured is not None:
                 attitude = measured, np.full(3, _ATTITUDE_STD + telemetry.offset_std)
@@ -200,9 +202,11 @@ class CameraLocaliser:
                 if centre is not None:
                     position = centre, _POSITION_STD
                 earlier = telemetry.rotation_at(time - dt)
-                if earlier is not None and telemetry.rate_hz > 8.0 and telemetry.offset_std < _CONVERGED_STD_S:
-                    rotation_step = measured @ earlier.T
-                    predicted = PlanePose(rotation_step @ pose.rotation, self._ego.predicted_centre(dt))
+                known = telemetry.offset_std < _CONVERGED_STD_S or gap
+                if earlier is not None and telemetry.rate_hz > 8.0 and known:
+                    way = self._reported_way(telemetry, time, dt) if gap else None
+                    moved = self._ego.predicted_centre(dt) if way is None else pose.centre + way
+                    predicted = PlanePose(measured @ earlier.T @ pose.rotation, moved)
         grey, factor = _to_grey(working), 1.0 if predicted is None else 0.6
         self._ego.update(
             grey, dt, excluded=excluded, predicted=predicted, std_factor=factor, attitude=attitude, position=position
@@ -210,6 +214,11 @@ class CameraLocaliser:
         self.photometric.update(working, *self._ego.correspondences)
         if telemetry is not None and isinstance(self._ego.pose, PlanePose) and self._ego.frames_without_pose == 0:
             telemetry.add_visual_attitude(time, self._ego.pose.rotation)
+
+    def _reported_way(self, telemetry: TelemetryTrack, time: float, dt: float) -> Floats | None:
+        """Way (3,) of the camera [m] in the last ``dt`` seconds by telemetry; None where that does not say."""
+        now, before = telemetry.position_at(time), telemetry.position_at(time - dt)
+        return None if not self.metric or now is None or before is None else now - before
 
     def better_frame(self, time: float, target: Box) -> GroundFrame | None:
         """Another initial ground frame, if telemetry now gives a better one. target: its present box."""

@@ -75,14 +75,24 @@ def find_offset(
         motion = compare_ways(visual, telemetry, body_from_camera, found.offset if correlated else 0.0)
         if motion is not None and motion.contradiction:
             return motion.contradiction
-    if not correlated:
+    return accepted_offset(found, motion)
+
+
+def accepted_offset(
+    found: OffsetSearch, motion: GroundMotion | None = None, most_std_s: float = _MAX_STD_S
+) -> OffsetEstimate | str:
+    """The offset at the maximum of a search, or the reason why it is not observable.
+
+    motion: to put into the answer. most_std_s: largest std that is accepted.
+    """
+    if found.evidence < found.threshold:
         return "the camera rotated too little, or its rotation does not match the telemetry"
     if found.evidence - found.second < _MIN_LOG_RATIO:
         return "the offset is ambiguous: the rotation varies too little"
     if found.at_end:
         return OUTSIDE
     offset, std, agreement = _refine(found)
-    if std > _MAX_STD_S:
+    if std > most_std_s:
         return f"its std would be {1e3 * std:.0f} ms: the camera rotated too little, or attitudes are too sparse"
     return OffsetEstimate(offset, std, agreement, motion)
 

@@ -31,8 +31,8 @@ def test_only_the_autopilots_attitudes_and_positions_are_read(tmp_path: Path, ah
             data += (1_700_000_000_000_000 + 50_000 * k).to_bytes(8, "big") + message.pack(codec)
     file = tmp_path / "flight.tlog"
     file.write_bytes(data)
-    log = read_tlog(file)
-    assert (len(log.samples), log.boots, log.left_out, log.unreadable) == (200, 1, 0, 0)
+    (log,) = read_tlog(file)
+    assert (len(log.samples), log.left_out, log.unreadable) == (200, 0, 0)
     last = log.samples[-1]
     assert last.position is not None
     assert last.position == pytest.approx([99.5, 0.0, -50.0])
@@ -54,7 +54,7 @@ def test_of_two_kinds_of_attitudes_and_positions_the_more_frequent_is_read(tmp_p
         for message in messages:
             data += (1_700_000_000_000_000 + 100_000 * k).to_bytes(8, "big") + message.pack(codec)
     (tmp_path / "a.tlog").write_bytes(data)
-    log = read_tlog(tmp_path / "a.tlog")
+    (log,) = read_tlog(tmp_path / "a.tlog")
     assert len(log.samples) == 100
     assert all(one.position is not None and one.position[2] == pytest.approx(-50.0) for one in log.samples)
 
@@ -74,5 +74,35 @@ def test_heights_of_a_log_are_above_home_where_the_local_frame_began_elsewhere(t
         for message in messages:
             data += (1_700_000_000_000_000 + 50_000 * k).to_bytes(8, "big") + message.pack(codec)
     (tmp_path / "a.tlog").write_bytes(data)
-    positions = [one.position for one in read_tlog(tmp_path / "a.tlog").samples[5:]]
+    positions = [one.position for one in read_tlog(tmp_path / "a.tlog")[0].samples[5:]]
     assert positions == [pytest.approx([0.0, 0.0, -50.0], abs=0.02)] * 195
+
+
+@pytest.mark.parametrize("late_s", [0.3, 1.5])
+def test_a_second_link_that_is_slower_changes_nothing(tmp_path: Path, late_s: float) -> None:
+    """By 0.3 s the local frame was moved by each message; by 1.5 s each was a reboot."""
+    codec, stamped = mavlink.MAVLink(None, 1, 1), []
+    for k in range(200):
+        for message in (
+            mavlink.MAVLink_attitude_message(60_000 + 50 * k, 0, 0, 0.01 * k, 0, 0, 0),
+            mavlink.MAVLink_local_position_ned_message(60_000 + 50 * k, k, 0, -50, 0, 0, 0),
+        ):
+            data = message.pack(codec)
+            stamped += [(0.05 * k, data), (0.05 * k + late_s, data)]
+    stamped.sort(key=lambda one: one[0])
+    (tmp_path / "a.tlog").write_bytes(b"".join(round(1e6 * s).to_bytes(8, "big") + data for s, data in stamped))
+    (log,) = read_tlog(tmp_path / "a.tlog")
+    assert (len(log.samples), log.left_out) == (200, 0)
+    assert [one.position for one in log.samples] == [pytest.approx([k, 0, -50]) for k in range(200)]
+
+
+def test_each_vehicle_and_each_boot_is_a_log_of_its_own(tmp_path: Path) -> None:
+    data = bytearray()
+    for system, begin_s, first_ms, count in ((1, 0.0, 90_000, 40), (1, 60.0, 9_000, 100), (2, 90.0, 50_000, 60)):
+        codec = mavlink.MAVLink(None, system, 1)
+        for k in range(count):
+            message = mavlink.MAVLink_attitude_message(first_ms + 50 * k, 0, 0, 0, 0, 0, 0)
+            data += round(1e6 * (begin_s + 0.05 * k)).to_bytes(8, "big") + message.pack(codec)
+    (tmp_path / "a.tlog").write_bytes(data)
+    found = [(log.system, len(log.samples), log.samples[0].time) for log in read_tlog(tmp_path / "a.tlog")]
+    assert found == [(1, 100, 9.0), (2, 60, 50.0), (1, 40, 90.0)]

@@ -84,6 +84,20 @@ def errors(video: Video, found: list[Estimate]) -> Floats:
     return np.array([float(np.hypot(*(np.array([e.x, e.y]) - video.truth(i)))) for i, e in enumerate(found)])
 
 
+def test_across_a_second_without_images_telemetry_says_where_the_camera_has_moved(background: Image) -> None:
+    """The camera was taken to have gone on for three frames: it was 13 m off, and the car lost for good."""
+    video = video_of(background, 80, 6.0, 5.0)
+    lens = Intrinsics(*SIZE, np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]]))
+    tracker = make_tracker("ground", SIZE, lens, BODY_FROM_DOWN_CAMERA, FPS)
+    for i in range(-30, len(video.car)):
+        tracker.handle_telemetry(Telemetry(i / FPS, np.eye(3), np.array([0.0, 0.1 * (40.0 + 5.0 * i), -30.0])))
+    tracker.begin(video.frame(0), 0.0, video.box())
+    for i in (*range(1, 30), *range(60, 80)):
+        found = tracker.handle_frame(video.frame(i), i / FPS)
+    assert found.state is TrackState.VISIBLE
+    assert float(np.hypot(*(np.array([found.x, found.y]) - video.truth(79)))) < 6.0
+
+
 def test_a_car_in_view_is_tracked_within_pixels(background: Image) -> None:
     video = video_of(background, 60, 4.0, 3.0)
     found = track(video)
