@@ -151,9 +151,9 @@ def check_attitudes(
     lens: Intrinsics,
     body_from_camera: Floats,
     progress: Callable[[int], None] | None = None,
-) -> tuple[tuple[Telemetry, ...], list[str]]:
-    """Samples near the video's clock, on that clock where the offset is observable, and warnings where it is large or
-    attitudes turn otherwise than the images.
+) -> tuple[tuple[Telemetry, ...], list[str], bool]:
+    """Samples on the video's clock where the offset is observable, else as they are; warnings where it is large or
+    attitudes turn otherwise than the images; whether it is observable.
 
     Raises InputError where another convention of quaternions or mounting explains what the images show.
     """
@@ -172,37 +172,38 @@ def check_attitudes(
 
     # None where its camera looks at the sky.
     given, motion, seen = search([(recorded.samples, body_from_camera)])[0]
+    correlated = given is not None and given.evidence >= given.threshold
     offset = None if given is None else accepted_offset(given, None, _MOST_STD_S)
+    if not correlated:
+        # Before an offset is looked for in all of the telemetry, where a wrong convention can fit somewhere, too.
+        others = search([read(recorded.samples, body_from_camera) for read in _CONVENTIONS.values()])
+        least = 0.0 if given is None else given.evidence
+        fits = {
+            one.evidence: name
+            for name, (one, _, _) in zip(_CONVENTIONS, others, strict=True)
+            if one is not None and one.evidence > least + one.threshold
+        }
+        if fits:
+            what = f"its attitudes do not turn as the video does, but would if {fits[max(fits)]}"
+            remedy = "give qw,qx,qy,qz of ned_from_body and body_from_camera; body axes are forward, right, down"
+            raise InputError(what, file=file, remedy=remedy)
     if not isinstance(offset, OffsetEstimate):
         wider = search_offset(seen, recorded.samples, body_from_camera)
         offset = None if isinstance(wider, str) else accepted_offset(wider, None, _MOST_STD_S)
-    samples, notes = recorded.samples, []
     if isinstance(offset, OffsetEstimate):
         # The tracker finds small ones in flight, too, but its ground frame begins before.
-        samples = tuple(replace(sample, time=sample.time - offset.offset) for sample in samples)
-        motion = compare_ways(seen, recorded.samples, body_from_camera, offset.offset)
+        samples = tuple(replace(sample, time=sample.time - offset.offset) for sample in recorded.samples)
+        notes = _check_motion(compare_ways(seen, recorded.samples, body_from_camera, offset.offset), file)
         if abs(offset.offset) > MAX_OFFSET_S:
             apart = f"{abs(offset.offset):.2f} s {'later' if offset.offset > 0.0 else 'earlier'}"
             what = f"by the rotation that both show its times are {apart} than the video's, and were corrected"
-            notes = [f"{file}: {what}: 0 is the video's first frame"]
-    if isinstance(offset, OffsetEstimate) or (given is not None and given.evidence >= given.threshold):
-        return samples, [*notes, *_check_motion(motion, file)]
-    least = 0.0 if given is None else given.evidence
-    others = search([read(recorded.samples, body_from_camera) for read in _CONVENTIONS.values()])
-    fits = {
-        one.evidence: name
-        for name, (one, _, _) in zip(_CONVENTIONS, others, strict=True)
-        if one is not None and one.evidence > least + one.threshold
-    }
-    if fits:
-        what = f"its attitudes do not turn as the video does, but would if {fits[max(fits)]}"
-        remedy = "give qw,qx,qy,qz of ned_from_body and body_from_camera; body axes are forward, right, down"
-        raise InputError(what, file=file, remedy=remedy)
-    if given is None or not given.contradicts:
-        return samples, _check_motion(motion, file)
+            notes = [f"{file}: {what}: 0 is the video's first frame", *notes]
+        return samples, notes, True
+    if correlated or given is None or not given.contradicts:
+        return recorded.samples, _check_motion(motion, file), False
     turn = f"its attitudes turn by {math.degrees(given.telemetry_rms):.1f} degrees rms, but not as the video does"
     remedy = "check body_from_camera in --rig, and that both are of one flight and on one clock"
-    return samples, [f"{file}: {turn}: {remedy}"]
+    return recorded.samples, [f"{file}: {turn}: {remedy}"], False
 
 
 def _check_motion(motion: GroundMotion | None, file: Path) -> list[str]:

@@ -125,12 +125,12 @@ def _sample(row: Floats) -> Telemetry:
     return Telemetry(float(row[0]), so3.from_quaternion(row[1:5]), position)
 
 
-def check_clock(telemetry: TelemetryFile, file: Path, start: float, end: float) -> list[str]:
+def check_clock(samples: Sequence[Telemetry], file: Path, start: float, end: float) -> list[str]:
     """A warning if more than a second of the video's time span has no sample within a second, as on another clock.
 
     Raises InputError if all of it has none.
     """
-    times = np.array([sample.time for sample in telemetry.samples])
+    times = np.array([sample.time for sample in samples])
     shown = f"times {times[0]:.1f} to {times[-1]:.1f} s, but the video's are {start:.1f} to {end:.1f} s"
     remedy = "give times on the video's clock, 0 = its first frame"
     if times[0] > end + 1.0 or times[-1] < start - 1.0:

@@ -246,6 +246,8 @@ class CameraAgent:
             target=self._target,
         )
         known = self._known
+        if known is not None and known.readout is not None:
+            message.readout_s = known.readout
         lens = info.intrinsics if known is None or known.intrinsics is None else known.intrinsics
         if lens is not None and (lens.width, lens.height) != (info.width, info.height) and info.intrinsics is not None:
             lens = info.intrinsics  # the images are smaller than those the rig file was calibrated for

@@ -67,7 +67,8 @@ def column_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:
                 f"{name}: {outside} of {len(pixels)} rows lie outside its {width}x{height} image; check size, u, v"
             )
         times = np.unique(np.concatenate([np.zeros(0), *(track.time for track in observations.of_camera(name))]))
-        frames = float(np.median(np.diff(times))) * camera.fps if len(times) >= _MANY_TIMES else 0.0
+        # Fewer may be of every thousandth frame.
+        frames = float(np.median(np.diff(times))) * camera.fps if len(times) >= _MANY_ROWS else 0.0
         for unit, factor in _WRONG_UNITS.items():
             if abs(frames / factor - 1.0) < _SAME_INTERVAL and not rig.shared_clock:
                 text = (

@@ -29,6 +29,7 @@ _SHORT_S = 0.5  # s: the last frame of a variable rate may last for longer than 
 
 if TYPE_CHECKING:
     from edge.uav.base import Telemetry
+    from edge.uav.georeference import Georeference
     from protocols.geometry.camera import Intrinsics
     from protocols.geometry.types import Floats
 
@@ -99,7 +100,6 @@ def track(
     from deploy.offline.track_overlay import draw
     from edge.devices.playback.video_writer import video_writer
     from edge.uav import tracker_factory
-    from edge.uav.georeference import Georeference
 
     for name, kind in ((tracking.TRACK, "a table"), (tracking.HYPOTHESES, "a table"), (tracking.OVERLAY, "a video")):
         check_file(out / name, kind, video, telemetry, csv_truth)
@@ -119,9 +119,10 @@ def track(
     size = (recording.info.width, recording.info.height)
     count = tracking.count_frames(video) if counted is None else counted
     samples: tuple[Telemetry, ...] = ()
+    georeference: Georeference | None = None
     if telemetry is not None:
         flight = _Flight(video, recording, rate, lens, mounting, start, count)
-        samples, warnings = _samples(telemetry, flight, json, model == "ground")
+        samples, warnings, georeference = _samples(telemetry, flight, json, model == "ground")
     tracker = tracker_factory.make_tracker(model, size, lens, mounting, recording.info.fps, seed)
     rows: list[tracking.TrackedFrame] = []
     with ExitStack() as stack:
@@ -141,7 +142,7 @@ def track(
             box,
             start=start,
             telemetry=samples,
-            georeference=None if lens is None or mounting is None else Georeference(lens, mounting),
+            georeference=georeference,
             show=None if write is None else lambda image, tracked: write(draw(image, tracked)),
             progress=frame_done,
         ):
@@ -200,13 +201,15 @@ def _watched(what: str, flight: _Flight, quiet: bool) -> Iterator[Callable[[int]
 
 def _samples(
     telemetry: Path, flight: _Flight, quiet: bool, needs_lens: bool
-) -> tuple[tuple[Telemetry, ...], list[str]]:
-    """The telemetry's samples on the video's clock, and warnings. Raises InputError."""
+) -> tuple[tuple[Telemetry, ...], list[str], Georeference | None]:
+    """The telemetry's samples, warnings, and what corrects positions by them where they are surely on the video's
+    clock. Raises InputError."""
     from deploy.offline import track as tracking
     from deploy.offline.telemetry_files import align_to_video, check_attitudes, read_telemetry_log
     from deploy.offline.track_log import LoggedFlightImages
+    from edge.uav.georeference import Georeference
 
-    recording, count, warnings = flight.recording, flight.frames, []
+    recording, count, warnings, aligned = flight.recording, flight.frames, [], False
     own_clock = telemetry.suffix.lower() in (".tlog", ".mcap")
     logged = isinstance(recording, LoggedFlightImages) and telemetry.resolve() == flight.video.resolve()
     source = recording.source if logged else None
@@ -222,15 +225,20 @@ def _samples(
     samples = recorded.samples
     if not own_clock:
         end = count / recording.info.fps if count else float("inf")
-        warnings += tracking.check_clock(recorded, telemetry, flight.start / recording.info.fps, end)
+        span = flight.start / recording.info.fps, end
+        gaps = tracking.check_clock(samples, telemetry, *span)
         if flight.lens is not None and flight.mounting is not None:
             with _watched("comparing the telemetry with", flight, quiet) as done:
                 given = flight.video, flight.rate, flight.lens, flight.mounting
-                samples, found = check_attitudes(recorded, telemetry, *given, done)
+                samples, found, aligned = check_attitudes(recorded, telemetry, *given, done)
+            if aligned:
+                gaps = tracking.check_clock(samples, telemetry, *span)
             warnings += found
+        warnings += gaps
     elif logged:
         # The agent has already put both on one clock.
         samples = tuple(replace(sample, time=sample.time - recording.first_s) for sample in samples)
+        aligned = True
     elif flight.lens is None or flight.mounting is None:
         samples = ()
     else:
@@ -238,7 +246,10 @@ def _samples(
             given = flight.video, flight.rate, flight.lens, flight.mounting
             samples, found = align_to_video(recorded, telemetry, *given, done)
         warnings += found
-    return samples, warnings
+        aligned = True
+    if not aligned or flight.lens is None or flight.mounting is None:
+        return samples, warnings, None
+    return samples, warnings, Georeference(flight.lens, flight.mounting)
 
 
 def _summarise(

@@ -28,6 +28,7 @@ from protocols.geometry.types import Floats
 _STAMP = 8  # bytes: Unix time in µs before each frame
 _REBOOT_S = 1.0  # by which a boot time goes back: less is reordering
 _LATE_S = 5.0  # after which what is older than that is of another boot, and not of a second, slower link
+_LATE_MESSAGES = 1000  # the same, at 200 messages a second: of a backlog that comes at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +135,10 @@ def _boots(stamped: list[_Stamped]) -> list[list[tuple[float, Any]]]:
 
 
 def _goes_on(stamped: list[_Stamped], k: int, newest: float) -> bool:
-    """Whether what is later than ``newest`` [s] comes soon after message k."""
-    for j in range(k, len(stamped)):
+    """Whether what is later than ``newest`` [s] comes soon after message k; not known of a log without stamps."""
+    if stamped[0].received_s == stamped[-1].received_s:
+        return False
+    for j in range(k, min(k + _LATE_MESSAGES, len(stamped))):
         if stamped[j].boot_s > newest or stamped[j].received_s > stamped[k].received_s + _LATE_S:
             return stamped[j].boot_s > newest
     return False

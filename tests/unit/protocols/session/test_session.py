@@ -9,6 +9,7 @@ import pytest
 
 from hub.api import calibrate, triangulate
 from protocols.core.errors import InputError, Refused
+from protocols.geometry.types import Floats
 from protocols.session.session import Session
 
 RIG = {name: {"size": np.array([640, 480]), "fps": 30.0} for name in ("GoPro 2", "CVLab1")}
@@ -87,9 +88,14 @@ def test_times_that_are_frame_numbers_are_named() -> None:
 @pytest.mark.parametrize(("unit", "factor"), [("milliseconds", 1e3), ("nanoseconds", 1e9)])
 def test_times_in_another_unit_are_named(unit: str, factor: float) -> None:
     """The solver took two minutes for "no alignment of the two tracks agrees with any geometry"."""
-    names, often = ["a"] * 20 + ["b"] * 20, np.arange(20) / 30.0
-    table = {"camera": names, "frame": np.tile(np.arange(20), 2), "u": np.full(40, 9.0), "v": np.full(40, 9.0)}
     rig = {name: {"size": [640, 480], "fps": 30.0} for name in ("a", "b")}
-    Session.from_table(rig, table | {"time": np.r_[often, 20.0 * np.arange(20)]})  # labelled by hand, now and then
+
+    def session(times: Floats) -> Session:
+        count = len(times)
+        table = {"camera": ["a"] * count + ["b"] * count, "frame": np.tile(np.arange(count), 2)}
+        table |= {"u": np.full(2 * count, 9.0), "v": np.full(2 * count, 9.0)}
+        return Session.from_table(rig, table | {"time": np.r_[np.arange(count) / 30.0, times]})
+
+    session(1000.0 / 30.0 * np.arange(20))  # labelled by hand: every thousandth frame
     with pytest.raises(InputError, match=f"b: its times are {unit}: .* divide them by "):
-        Session.from_table(rig, table | {"time": np.r_[often, factor * often]})
+        session(factor / 30.0 * np.arange(120))
