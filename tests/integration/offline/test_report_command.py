@@ -75,9 +75,23 @@ def test_without_the_session_the_rest_is_still_reported(
     assert run(["report", str(tmp_path / "out"), "--json"]) == 0
     expected = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert expected["report"] == str(tmp_path / "out" / "report.html")
+    assert (expected["level"], expected["attention"]) == ("good", []), "it says nothing about the result"
     text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "the session is no longer here" in text.lower()
+    assert "its session is not found" in text.lower()
     assert "<h2>Clock offsets" in text
+
+
+def test_what_to_check_is_printed(solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Results that are usable with care were, without a word of why."""
+    shutil.copytree(solved / "out", tmp_path / "out")
+    result = tmp_path / "out" / "result.json"
+    document = json.loads(result.read_text(encoding="utf-8"))
+    result.write_text(json.dumps(document | {"warnings": ["cam0: its measured lens is refuted"]}), encoding="utf-8")
+    capsys.readouterr()
+    assert run(["report", str(tmp_path / "out"), "--session", str(solved / "session")]) == 0
+    output = capsys.readouterr().out
+    assert "Usable with care" in output
+    assert "check: cam0: its measured lens is refuted" in output
 
 
 def test_a_refused_session_has_a_report_of_the_reasons(
