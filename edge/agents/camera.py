@@ -232,7 +232,7 @@ class CameraAgent:
         return message
 
     def _info(self) -> pb.CameraInfo:
-        info, known = self._device.info, self._known
+        info = self._device.info
         message = pb.CameraInfo(
             schema_version=SCHEMA_VERSION,
             camera=self._camera,
@@ -242,9 +242,12 @@ class CameraAgent:
             fps=info.fps,
             driver=info.driver,
             clock=info.clock,
-            readout_s=info.readout_s if known is None or known.readout is None else known.readout,
+            readout_s=info.readout_s,
             target=self._target,
         )
+        known = self._known
+        if known is not None and known.readout is not None:
+            message.readout_s = known.readout
         lens = info.intrinsics if known is None or known.intrinsics is None else known.intrinsics
         if lens is not None and (lens.width, lens.height) != (info.width, info.height) and info.intrinsics is not None:
             lens = info.intrinsics  # the images are smaller than those the rig file was calibrated for

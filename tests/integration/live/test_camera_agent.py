@@ -109,7 +109,7 @@ def test_pose_and_intrinsics_of_the_rig_file_are_in_the_camera_info() -> None:
         rotation=rotation,
         position_std=np.full(3, 0.01),
         focal_std=0.1,
-        readout=0.02,
+        readout=-0.012,
     )
     agent = CameraAgent(ListedDevice([0]), ScriptedDetector(), MemoryBus(hub), "cam0", known=known, target="light")
     agent.run(threading.Event())
@@ -121,7 +121,8 @@ def test_pose_and_intrinsics_of_the_rig_file_are_in_the_camera_info() -> None:
     assert not info.rotation_std
     assert list(info.matrix) == lens.matrix.ravel().tolist()
     assert list(info.distortions) == lens.distortions.tolist()
-    assert (info.focal_std, info.readout_s) == (0.1, 0.02)
+    assert info.focal_std == 0.1
+    assert info.readout_s == -0.012
 
 
 def test_it_is_announced_while_it_runs_and_stops_on_request() -> None:

@@ -67,7 +67,7 @@ def test_a_target_on_a_black_image_is_refused(model: str) -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_a_filter_of_a_black_image_is_finite() -> None:
-    learnt, box = CorrelationFilter(30.0, 20.0), OrientedBox.upright(Box(100.0, 100.0, 30.0, 20.0))
+    learnt, box = CorrelationFilter(40.0, 20.0), OrientedBox.upright(Box(100.0, 100.0, 40.0, 20.0))
     black = np.zeros((240, 320, 3), np.uint8)
     learnt.learn(black, box)
     assert np.isfinite(learnt.respond(black, box).log_ratio)
