@@ -18,7 +18,7 @@ from protocols.core.errors import InputError, Refused
 from protocols.core.files import check_folder, remove_files, write_atomically, write_together
 from protocols.core.tables import dataframe
 from protocols.geometry import so3
-from protocols.log.read.session import is_log, load_session
+from protocols.log.read.session import is_log, load_session, no_session
 from protocols.session.calibration import (
     Calibration,
     CameraCalibration,
@@ -179,8 +179,7 @@ def read_session(path: str | Path, observations: str | Path | None = None) -> Se
     try:
         rig, found, priors, warnings = session_from_messages(messages)
     except Refused as refusal:
-        remedy = "record cameras that see what moves"
-        raise InputError(f"no session in this log: {refusal.reason}", file=path, remedy=remedy) from None
+        raise no_session(path, refusal) from None
     damage = (f"the log is damaged: {reader.damage}",) if reader.damage else ()
     return RecordedSession(rig, found, damage + warnings, path.stem, priors)
 

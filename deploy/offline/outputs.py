@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hub.api import CALIBRATION, REPORT, RESULT, TRAJECTORY, CalibrationResult, save_refusal
-from protocols.core.errors import Refused
+from protocols.core.errors import InputError, Refused
 from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -20,12 +20,18 @@ _ADVICE_OFFSET_STD_S = 0.002  # clock offset std above which advice is printed
 
 def report_result(result: CalibrationResult, out: Path, command: str, echo_json: bool = False) -> None:
     """Write all four outputs, or none, and print the summary, or result.json. Raises InputError."""
-    document = result.save(out, command)
+    calibration = result.calibration
+    try:
+        document = result.save(out, command)
+    except InputError:
+        if not echo_json:
+            print_summary(calibration)  # a full disk costs the files, not what a hub found
+        raise
     if echo_json:
         print(json.dumps(document, allow_nan=False))
         return
-    calibration = result.calibration
-    print_summary(calibration, out)
+    print_summary(calibration)
+    print(f"written: {', '.join(str(out / name) for name in (CALIBRATION, TRAJECTORY, RESULT, REPORT))}")
     imprecise = {
         name: ""
         for name, camera in calibration.cameras.items()
@@ -78,8 +84,8 @@ def wide_console(markup: bool = False) -> Any:
     return _Console(file=sys.stdout, highlight=False, markup=markup, width=None if sys.stdout.isatty() else 140)
 
 
-def print_summary(calibration: Calibration, out: Path) -> None:
-    """Print a table of the cameras, the refused cameras, warnings and the paths of the written files."""
+def print_summary(calibration: Calibration) -> None:
+    """Print a table of the cameras, the refused cameras and warnings."""
     unit = calibration.units if calibration.scale == "metric" else "baselines"
     table = [("camera", "lag [s]", "± [ms]", "rate [ppm]", "±", f"position [{unit}]", "±", "rms [px]")]
     table += [
@@ -106,4 +112,3 @@ def print_summary(calibration: Calibration, out: Path) -> None:
         print(f"refused {name}: {reason}")
     for warning in calibration.warnings:
         print(f"warning: {warning}")
-    print(f"written: {', '.join(str(out / name) for name in (CALIBRATION, TRAJECTORY, RESULT, REPORT))}")

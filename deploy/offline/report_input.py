@@ -88,7 +88,8 @@ def _input_from_folder(folder: Path, session: Path | None) -> ReportInput:
         read = read_session(place)
         rig, observations = read.rig, read.observations
     else:
-        missing = "the session is no longer here: figures that need the observations are left out (--session)"
+        missing = "its session is not found: figures of the observations are left out; give it or its log by --session"
+        observations = Observations({}, (missing,))
     refused = {str(name): str(why) for name, why in _table(metadata.get("refused")).items()}
     warnings = tuple(str(text) for text in document.get("warnings") or ())
     pairs = tuple(_pair(pair) for pair in document.get("pairs") or ())
@@ -96,7 +97,7 @@ def _input_from_folder(folder: Path, session: Path | None) -> ReportInput:
     if document.get("status") != "solved":
         if rig is None:
             raise InputError(
-                "refused, and its session is no longer here", file=folder, remedy="give the session with --session"
+                "refused, and its session is not found", file=folder, remedy="give it or its log by --session"
             )
         reason = str(document.get("reason") or "no reason given")
         refusal = Refused(reason, refused, pairs, warnings, acceptance)
@@ -115,7 +116,7 @@ def _input_from_folder(folder: Path, session: Path | None) -> ReportInput:
         refused=refused,
         trajectories=tables,
         pairs=pairs,
-        warnings=warnings + ((missing,) if missing else ()),
+        warnings=warnings,
         cpu_seconds=float(document.get("cpu_seconds") or 0.0),
         convergence=_steps(document.get("convergence")),
         acceptance=acceptance,

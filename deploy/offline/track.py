@@ -34,6 +34,8 @@ GROUND_COLUMNS = ("north", "east", "speed", "course", "std_m")
 BASIS = "basis"
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _POSITION = ("north", "east", "down")
+# Their height may be of the sea or the ellipsoid: they give no position above the ground.
+_GEODETIC = ("lat", "lon", "alt", "latitude", "longitude", "altitude")
 _TELEMETRY_LOOKAHEAD_S = 0.6  # lead with which samples are passed to the tracker: clocks may differ by 0.5 s
 
 
@@ -56,12 +58,14 @@ class TrackedFrame:
 @dataclass(frozen=True, slots=True, eq=False)
 class TelemetryFile:
     """Telemetry samples in strictly increasing time. left_out: discarded rows (NaN, no rotation, repeated time).
-    back: rows of an earlier time than the row above. others: of a log, the samples of other vehicles and boots."""
+    back: rows of an earlier time than the row above. others: of a log, the samples of other vehicles and boots.
+    unused: its columns of positions that are none."""
 
     samples: tuple[Telemetry, ...]
     left_out: int
     back: int = 0
     others: tuple[tuple[Telemetry, ...], ...] = ()
+    unused: tuple[str, ...] = ()
 
 
 def parse_target(text: str) -> Box:
@@ -99,7 +103,7 @@ def read_telemetry(file: Path) -> TelemetryFile:
     if file.suffix.lower() in (".bin", ".ulg"):
         remedy = "give the .tlog, or export a telemetry.csv with time,qw,qx,qy,qz[,north,east,down]"
         raise InputError(f"{file.suffix} telemetry can't be read by this version", file=file, remedy=remedy)
-    cells = read_csv_table(file, "telemetry", ("time", *_QUATERNION), _POSITION)
+    cells = read_csv_table(file, "telemetry", ("time", *_QUATERNION), (*_POSITION, *_GEODETIC))
     position = _POSITION if cells.columns.keys() >= set(_POSITION) else ()
     table = np.column_stack([cells.numbers_or_gaps(name) for name in ("time", *_QUATERNION, *position)])
     length = np.linalg.norm(table[:, 1:5], axis=1)
@@ -116,7 +120,8 @@ def read_telemetry(file: Path) -> TelemetryFile:
     placed = np.isfinite(table[:, 5:]).all(axis=1) & (table.shape[1] == 8)
     if placed.any() and not placed.all():
         table[~placed, 5:] = interpolate_positions([(row[0], row[5:]) for row in table[placed]], table[~placed, 0])
-    return TelemetryFile(tuple(_sample(row) for row in table), left_out, back)
+    unused = () if position else tuple(name for name in (*_POSITION, *_GEODETIC) if name in cells.columns)
+    return TelemetryFile(tuple(_sample(row) for row in table), left_out, back, unused=unused)
 
 
 def _sample(row: Floats) -> Telemetry:

@@ -368,6 +368,8 @@ class UavAgent:
             self._control.stop()
         elif accepted:
             self._control.begin(self._now_ns() / NANOSECONDS)
+        else:
+            self.camera.say("Syncline: nothing to track there, select again")
         self._update_tracking_status()
         return accepted
 

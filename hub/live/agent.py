@@ -303,7 +303,7 @@ def status_message(
         named = ", ".join(f"{name}{reasons.get(name, '')}" for name in sorted(left)[:_NAMED_CAMERAS])
         message.message += f"; heard but not calibrated: {named}"
     alarms = [*hub.stream.clocks.alarms.values(), *hub.clock_contradictions()]
-    message.message = "; ".join([*alarms, message.message])[:1000]
+    message.message = "; ".join(filter(None, [*alarms, message.message, hub.unmatched(now)]))[:1000]
     _add_parts(message, hub, now)
     for counts in counters:
         for name, count in counts.items():

@@ -358,6 +358,13 @@ class LiveHub:
         """Seconds since the last frame of each camera that is calibrated or was heard of lately."""
         return self.links.ages(now, () if self.calibration is None else self.calibration.cameras)
 
+    def unmatched(self, now: float) -> str:
+        """Cameras of the hub's rig.toml that are not heard while others are, as with a wrong name; "" if none."""
+        given = {} if self._rig is None or self._known is not None else self._rig.cameras
+        heard = self.frame_ages(now)
+        absent, others = [name for name in given if name not in heard], [name for name in heard if name not in given]
+        return f"not heard of rig's {listed(absent)}; not in it: {listed(others)}" if absent and others else ""
+
     def offset_stds(self) -> dict[str, float]:
         """Standard deviation [s] of each calibrated camera's time offset."""
         cameras = {} if self.calibration is None else self.calibration.cameras

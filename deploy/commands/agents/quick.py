@@ -95,6 +95,9 @@ def quick(
     remove_outputs(out)
     devices = _simulated(seed) if simulated else _video_files(source) if source else _webcams(cameras)
     known = None if rig is None else read_rig(rig)
+    if known is not None and known.cameras.keys().isdisjoint(devices):
+        what = f"knows cameras {', '.join(known.cameras)}, none of {', '.join(devices)}"
+        raise InputError(what, file=rig, remedy="name its tables like these")
     view = None if headless else _make_view_server(port)
     report = (lambda text: None) if json else lambda text: print(text, flush=True)
     settings = QuickSettings(

@@ -70,8 +70,17 @@ def report(
         )
     rig, labels = report_input.rig, report_input.observations.labels
     todo = [in_words_of(line, rig, labels) for line in assessment.actions]
-    summary = {"report": str(file), "level": assessment.level, "verdict": assessment.headline, "todo": todo}
-    answer(summary, [assessment.headline, *(f"to do: {line}" for line in todo), *closing_lines((), [file])], json)
+    marked = [(in_words_of(one.text, rig, labels), one.action) for one in assessment.of("attention")]
+    summary = {
+        "report": str(file),
+        "level": assessment.level,
+        "verdict": assessment.headline,
+        "attention": [text for text, _ in marked],
+        "todo": todo,
+    }
+    checks = [f"check: {text}" for text, action in marked if not action]  # an action names its cause
+    closing = closing_lines([report_input.missing] if report_input.missing else [], [file])
+    answer(summary, [assessment.headline, *checks, *(f"to do: {line}" for line in todo), *closing], json)
     if browser:
         open_browser(file.resolve().as_uri())
     return EXIT_DONE

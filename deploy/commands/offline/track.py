@@ -222,6 +222,9 @@ def _samples(
     if recorded.back:
         what = f"its times go back {recorded.back} times, and were sorted"
         warnings.append(f"{telemetry}: {what}: of a clock that was set, rows of two times are mixed")
+    if recorded.unused:
+        what = f"its positions are not used, as it has {','.join(recorded.unused)} but not north,east,down"
+        warnings.append(f"{telemetry}: {what}: give these three in metres, down 0 on the ground")
     samples = recorded.samples
     if not own_clock:
         end = count / recording.info.fps if count else float("inf")

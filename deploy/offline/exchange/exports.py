@@ -72,6 +72,6 @@ def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
         if (out / name).exists():
             raise InputError(f"a {name} is there already", file=out, remedy="choose another --out")
     rig, observations, warnings = session_from_log(log)
+    write_observations(out / OBSERVATIONS_FILE, observations)  # before the small one: a full disk leaves no session
     write_rig(out / RIG_FILE, rig_tables_of_log(rig))
-    write_observations(out / OBSERVATIONS_FILE, observations)
     return len(rig.cameras), len(observations), warnings

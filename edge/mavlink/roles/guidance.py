@@ -54,7 +54,7 @@ class Guidance:
         self.armed_by: int | None = None
         self._disarmed = _NOT_ARMED
         self.counters: Counter[str] = Counter()
-        self.hold_reason = "off" if not (limits.gimbal or limits.follow) else "no target"
+        self.hold_reason = "commands are off" if not (limits.gimbal or limits.follow) else "no target"
 
     def begin(self, vehicle: Floats | None) -> None:
         """A target was selected while the vehicle was at a position (3,) NED [m]."""

@@ -142,7 +142,7 @@ class CorrelationFilter:
         power = (spectrum * np.conj(spectrum)).real
         wanted = spectrum * np.conj(self._label)
         shape = self._cells[::-1]
-        scale = np.float32(power.mean())
+        scale = np.float32(max(power.mean(), 1e-12))  # 0 where the window has one colour
         power, wanted = power / scale, wanted / scale
         found = wanted / (power + np.float32(_REGULARISATION))
         found = self._fft(scipy.fft.irfft2(found, s=shape) * self._mask)

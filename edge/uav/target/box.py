@@ -35,6 +35,11 @@ def check_target_box(image: Image, size: tuple[int, int], target: Box) -> None:
         raise InputError(what, remedy="give x,y,w,h with width and height")
     if target.width * target.height > 0.5 * width * height:
         raise InputError(f"target {text} fills the image", remedy="draw the box round one target")
+    left, top = max(int(target.x - target.width), 0), max(int(target.y - target.height), 0)
+    around = image[top : int(target.y + 2 * target.height), left : int(target.x + 2 * target.width)]
+    if np.ptp(around, axis=(0, 1)).max() == 0:
+        what = f"target {text} and all around it have one colour: nothing tells it apart"
+        raise InputError(what, remedy="select it in an image that shows it, in a video by --start FRAME")
 
 
 def has_frame_format(image: Image, size: tuple[int, int]) -> bool:

@@ -45,8 +45,19 @@ def session_from_log(file: Path) -> tuple[Rig, Observations, tuple[str, ...]]:
     try:
         rig, observations = builder.build()
     except Refused as refusal:
-        raise InputError(
-            f"no session in this log: {refusal.reason}", file=file, remedy="record cameras that see what moves"
-        ) from None
+        raise no_session(file, refusal) from None
     damage = (f"the log is damaged: {reader.damage}",) if reader.damage else ()
     return rig, observations, damage + builder.warnings
+
+
+def no_session(file: Path, refusal: Refused) -> InputError:
+    """The error of a log without a session, which names the command for a UAV agent's."""
+    from protocols.log.read.reader import LogReader
+    from protocols.topics import FLIGHT_IMAGE, UAV_INFO
+
+    remedy = "record cameras that see what moves"
+    if any(LogReader(file).messages([UAV_INFO])):
+        pictured = any(LogReader(file).messages([FLIGHT_IMAGE]))
+        follow = "follow its target by syncline track LOG --target x,y,w,h"
+        remedy = follow if pictured else "it is a UAV agent's without images: for syncline track, record with [images]"
+    return InputError(f"no session in this log: {refusal.reason}", file=file, remedy=remedy)

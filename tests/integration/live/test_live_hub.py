@@ -21,6 +21,7 @@ from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
 from protocols.session.calibration import read_calibration
+from protocols.session.rig import Rig
 from tests.support.rigs import Session, simulate
 from tests.support.session_messages import info_messages, row_messages
 
@@ -374,6 +375,16 @@ def test_a_given_calibration_that_the_rows_contradict_is_named(
     state, text = given.state(0.01 * len(stream))
     assert state == ("degraded" if said else "calibrated"), text
     assert said in text
+
+
+@pytest.mark.parametrize(("name", "said"), [("cam9", "not heard of rig's cam9; not in it: cam1, cam2"), ("cam1", "")])
+def test_a_wrong_name_in_the_hubs_rig_is_named_in_the_status(session: Session, name: str, said: str) -> None:
+    """Its table was silently without effect."""
+    camera = session.rig.cameras["cam0"]
+    hub = LiveHub(SETTINGS, Rig({"cam0": camera, name: replace(camera, name=name)}))
+    feed(hub, [one for one in messages(session) if isinstance(one, pb.CameraInfo | pb.Observation)][:60])
+    text = status_message(hub, "hub", "b0", 0, [], 0.0).message
+    assert (said in text) if said else ("rig's" not in text)
 
 
 def test_a_camera_that_is_left_out_is_named_in_the_status(session: Session) -> None:

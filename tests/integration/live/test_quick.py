@@ -114,6 +114,7 @@ def test_the_ball_of_the_simulated_scene_is_learned_from_a_click() -> None:
         (["--simulated", "--source", "a.mp4"], "exclude each other"),
         (["--field-of-view", "0"], "is out of range"),
         (["--seconds", "nan"], "is out of range"),
+        (["--simulated", "--rig", "rig.toml"], "rig.toml: knows cameras left, none of cam0, cam1"),
     ],
 )
 def test_bad_use_is_reported_in_one_line(
@@ -124,4 +125,5 @@ def test_bad_use_is_reported_in_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text('[left]\nname = "left"\nsize = [640, 480]\n')
     assert expected_text in refusal(capsys, ["quick", *words])

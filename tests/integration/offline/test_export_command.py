@@ -113,3 +113,16 @@ def test_a_writer_checks_that_it_stays_in_its_folder(tmp_path: Path) -> None:
     for name in ("../x.yml", "/x.yml", "a/b.yml", "a\\b.yml", "..", "", "a\0b"):
         with pytest.raises(InputError):
             file_in(tmp_path, name)
+
+
+def test_a_full_disk_leaves_no_half_session_that_refuses_the_next_export(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(file: Path, observations: object) -> None:
+        raise InputError("cannot be written: No space left on device", file=file, remedy="free some space")
+
+    log = Path(__file__).parents[2] / "replay" / "logs" / "v1.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr("protocols.session.folder.write_observations", full)
+        assert run(["export", str(log), "--out", str(tmp_path / "out")]) == 2
+    assert run(["export", str(log), "--out", str(tmp_path / "out")]) == 0

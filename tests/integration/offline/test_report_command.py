@@ -11,7 +11,7 @@ import pytest
 
 from deploy.cli import run
 from deploy.offline.report_input import load_report_input
-from protocols.core.errors import Refused
+from protocols.core.errors import InputError, Refused
 from protocols.session.calibration import Calibration
 from tests.support.command_line import refusal
 
@@ -75,9 +75,38 @@ def test_without_the_session_the_rest_is_still_reported(
     assert run(["report", str(tmp_path / "out"), "--json"]) == 0
     expected = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert expected["report"] == str(tmp_path / "out" / "report.html")
+    assert (expected["level"], expected["attention"]) == ("good", []), "it says nothing about the result"
     text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "the session is no longer here" in text.lower()
+    assert "its session is not found" in text.lower()
     assert "<h2>Clock offsets" in text
+
+
+def test_a_full_disk_costs_the_files_and_not_the_table(
+    solved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(result: object, out: Path, command: str) -> None:
+        raise InputError("cannot be written: No space left on device", file=out, remedy="free some space")
+
+    monkeypatch.setattr("hub.api.CalibrationResult.save", full)
+    capsys.readouterr()
+    assert run(["calibrate", str(solved / "session"), "--out", str(tmp_path / "out")]) == 2
+    shown = capsys.readouterr()
+    assert "cam1" in shown.out
+    assert "written" not in shown.out
+    assert "No space left" in shown.err
+
+
+def test_what_to_check_is_printed(solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Results that are usable with care were, without a word of why."""
+    shutil.copytree(solved / "out", tmp_path / "out")
+    result = tmp_path / "out" / "result.json"
+    document = json.loads(result.read_text(encoding="utf-8"))
+    result.write_text(json.dumps(document | {"warnings": ["cam0: its measured lens is refuted"]}), encoding="utf-8")
+    capsys.readouterr()
+    assert run(["report", str(tmp_path / "out"), "--session", str(solved / "session")]) == 0
+    output = capsys.readouterr().out
+    assert "Usable with care" in output
+    assert "check: cam0: its measured lens is refuted" in output
 
 
 def test_a_refused_session_has_a_report_of_the_reasons(

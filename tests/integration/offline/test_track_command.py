@@ -19,7 +19,8 @@ from protocols.geometry import so3
 from protocols.geometry.types import Floats
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
-from protocols.topics import FLIGHT_IMAGE, TELEMETRY
+from protocols.topics import FLIGHT_IMAGE, TELEMETRY, UAV_INFO
+from tests.support.samples import flight_image, uav_info
 from tests.support.videos import write_video
 
 SIZE = (320, 240)
@@ -129,6 +130,32 @@ def test_positions_may_come_less_often_than_attitudes_and_times_that_go_back_are
     assert "positions were used in no frame" not in output
     assert "its times go back 1 times" in output
     assert float(table(tmp_path / "out" / "track.csv")[20]["speed"]) == pytest.approx(12.0, abs=1.0)
+
+
+@pytest.mark.parametrize("header", ["north,east,height", "lat,lon,alt"])
+def test_columns_of_positions_that_are_not_used_are_named(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], header: str
+) -> None:
+    text = (recording / "telemetry.csv").read_text().replace("north,east,down", header)
+    (tmp_path / "telemetry.csv").write_text(text)
+    extra = ["--rig", str(recording / "rig.toml"), "--telemetry", str(tmp_path / "telemetry.csv")]
+    assert run(["track", str(recording / "pictures"), "--target", TARGET, "--out", str(tmp_path / "out"), *extra]) == 0
+    names = header.removesuffix(",height")
+    assert f"its positions are not used, as it has {names} but not north,east,down" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("pictured", "remedy"), [(True, "syncline track"), (False, "record with [images]")])
+def test_the_log_of_a_flight_is_no_session_but_can_be_tracked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], pictured: bool, remedy: str
+) -> None:
+    with LogWriter(tmp_path / "a.mcap") as log:
+        log.write(UAV_INFO, "uav0", "site", uav_info("uav0"), 1)
+        if pictured:
+            log.write(FLIGHT_IMAGE, "uav0", "site", flight_image("uav0"), 2)
+    for command in ("report", "calibrate", "export"):
+        out = tmp_path / ("r.html" if command == "report" else "out")
+        assert run([command, str(tmp_path / "a.mcap"), "--out", str(out)]) == 2
+        assert remedy in capsys.readouterr().err
 
 
 def test_a_video_file_gives_its_own_times_and_a_larger_overlay(recording: Path, tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def kinds(messages: list[Any]) -> set[str]:
 def test_nothing_is_sent_unless_enabled() -> None:
     under_test = GuidanceUnderTest()
     assert under_test.tick(0.0) == []
-    assert under_test.guidance.hold_reason == "off"
+    assert under_test.guidance.hold_reason == "commands are off"
     assert kinds(GuidanceUnderTest(follow=True).tick(0.0)) == {"FOLLOW_TARGET"}
     assert kinds(GuidanceUnderTest(gimbal=True).tick(0.0)) == {"COMMAND_LONG", "GIMBAL_MANAGER_SET_PITCHYAW"}
 

@@ -306,4 +306,5 @@ def test_a_turn_must_show_in_the_similarity(scene: Image, turned: float, kept: b
 
 @pytest.mark.parametrize("box", [(40, 330, 60, 395), (200, 300, 230, 421), (0, 355, 30, 366)])
 def test_a_box_drawn_somewhat_beyond_the_border_is_taken(box: tuple[int, ...]) -> None:
-    check_target_box(np.zeros((720, 1280, 3), np.uint8), (1280, 720), Box(*map(float, box)))
+    image = np.random.default_rng(0).integers(0, 256, (720, 1280, 3), np.uint8)
+    check_target_box(image, (1280, 720), Box(*map(float, box)))

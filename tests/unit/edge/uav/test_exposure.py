@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from edge.uav.base import Box
+from edge.uav.correlation.filter import CorrelationFilter
+from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.ground.photometric import contrast_table
 from edge.uav.image_motion.scene_motion import SceneMotion
 from edge.uav.tracker_factory import make_tracker
+from protocols.core.errors import InputError
 from tests.bench.uav_any_view import in_light
 from tests.support.oblique.world import ObliqueWorld
 
@@ -55,8 +58,16 @@ def test_contrast_is_never_reduced_and_levels_keep_their_order(low: int) -> None
     assert contrast_table(np.zeros((40, 40, 3), np.uint8)) is not None  # nothing to see, and no division by zero
 
 
-def test_a_black_first_image_is_no_error() -> None:
-    tracker = make_tracker("ground", (320, 240))
+@pytest.mark.parametrize("model", ["ground", "plain", "paper"])
+def test_a_target_on_a_black_image_is_refused(model: str) -> None:
     black = np.zeros((240, 320, 3), np.uint8)
-    tracker.begin(black, 0.0, Box(100.0, 100.0, 30.0, 20.0))
-    assert np.isfinite(tracker.handle_frame(black, 0.1).std)
+    with pytest.raises(InputError, match=r"one colour.*--start"):
+        make_tracker(model, (320, 240)).begin(black, 0.0, Box(100.0, 100.0, 30.0, 20.0))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_filter_of_a_black_image_is_finite() -> None:
+    learnt, box = CorrelationFilter(40.0, 20.0), OrientedBox.upright(Box(100.0, 100.0, 40.0, 20.0))
+    black = np.zeros((240, 320, 3), np.uint8)
+    learnt.learn(black, box)
+    assert np.isfinite(learnt.respond(black, box).log_ratio)

@@ -25,14 +25,18 @@ class Boxes:
         return [Detection(0.0, 0.0, kind="vehicle", box=box) for box in BOXES] + [Detection(1.0, 1.0)]
 
 
-def selected(detector: Detector | None, u: float, v: float) -> list[float]:
-    """The box [px] that is tracked after the point (u, v) of a 640x480 image was selected."""
-    anything = cast(Any, SimpleNamespace(begin=lambda position: None, status=TrackingStatus(), info=None))
+def agent_with(detector: Detector | None, said: list[str] | None = None) -> UavAgent:
+    """An agent without connections; what it tells the stations is appended to ``said``."""
+    say = [].append if said is None else said.append
+    anything = cast(Any, SimpleNamespace(begin=lambda position: None, say=say, status=TrackingStatus(), info=None))
     vehicle = Vehicle(cast(Link, anything), gimbal=False)
     settings = UavSettings((640, 480), 30.0, None, None, model="plain")
-    agent = UavAgent(
-        anything, anything, vehicle, lambda execute: anything, anything, "uav", settings, detector=detector
-    )
+    return UavAgent(anything, anything, vehicle, lambda execute: anything, anything, "uav", settings, detector=detector)
+
+
+def selected(detector: Detector | None, u: float, v: float) -> list[float]:
+    """The box [px] that is tracked after the point (u, v) of a 640x480 image was selected."""
+    agent = agent_with(detector)
     boxes: list[list[float]] = []
     agent._publish = lambda message: boxes.append(list(getattr(message, "box", ())))
     image = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
@@ -50,3 +54,12 @@ def test_where_nothing_is_detected_the_box_is_around_the_point() -> None:
     for detector in (Boxes(), None):
         x, y, width, height = selected(detector, 300.0, 50.0)
         assert (x + 0.5 * width, y + 0.5 * height) == pytest.approx((299.5, 49.5))
+
+
+def test_a_selection_on_a_black_image_is_refused_and_the_stations_are_told() -> None:
+    said: list[str] = []
+    agent = agent_with(None, said)
+    agent._take_frame(Frame(np.zeros((480, 640, 3), np.uint8), 0, 10**9), 10**9)
+    assert not agent._execute(SelectTarget(0.5, 0.5, 0.5, 0.5, 255))
+    assert said == ["Syncline: nothing to track there, select again"]
+    assert len(said[0]) <= 50
