@@ -199,10 +199,9 @@ def test_without_forwarding_on_its_port_a_px4_keeps_station_and_camera_apart() -
     assert site.camera.commands == []
 
 
-@pytest.mark.parametrize("turned", [1.0, -1.0])
-def test_a_camera_that_is_mounted_otherwise_than_stated_gives_no_position(turned: float) -> None:
+def test_a_camera_that_is_mounted_otherwise_than_stated_gives_no_position() -> None:
     """Positions were some 50 m off, with an accuracy of 0.5 m, and nobody was told."""
-    flight = Flight(scenarios.get("far", 1, (320, 240)), turned=np.diag([turned, turned, 1.0]))
+    flight = Flight(scenarios.get("far", 1, (320, 240)), turned=np.diag([-1.0, -1.0, 1.0]))
     flight.run(1.5)
     assert flight.select()
     flight.run(7.7)
@@ -210,11 +209,7 @@ def test_a_camera_that_is_mounted_otherwise_than_stated_gives_no_position(turned
     texts = [message.text for message in flight.station.received["STATUSTEXT"]]
     estimate = flight.agent.estimate
     assert estimate is not None
-    if turned > 0.0:
-        assert math.isfinite(estimate.north)
-        assert status.state == "running"
-    else:
-        assert math.isnan(estimate.north)
-        assert status.state == "degraded"
-        assert "as of a camera turned by 180 degrees: check body_from_camera" in status.message
-    assert any("attitude unlike the images" in text for text in texts) == (turned < 0.0)
+    assert math.isnan(estimate.north)
+    assert status.state == "degraded"
+    assert "as of a camera turned by 180 degrees: check body_from_camera" in status.message
+    assert any("attitude unlike the images" in text for text in texts)

