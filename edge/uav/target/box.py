@@ -38,7 +38,7 @@ def check_target_box(image: Image, size: tuple[int, int], target: Box) -> None:
     left, top = max(int(target.x - target.width), 0), max(int(target.y - target.height), 0)
     around = image[top : int(target.y + 2 * target.height), left : int(target.x + 2 * target.width)]
     if np.ptp(around, axis=(0, 1)).max() == 0:
-        what = f"target {text} and all around it have one colour: nothing tells it apart"
+        what = f"target {text} and all around it have one colour: it cannot be distinguished"
         raise InputError(what, remedy="select it in an image that shows it, in a video by --start FRAME")
 
 

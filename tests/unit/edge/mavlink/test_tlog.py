@@ -108,7 +108,7 @@ def test_each_vehicle_and_each_boot_is_a_log_of_its_own(tmp_path: Path) -> None:
     assert found == [(1, 100, 9.0), (2, 60, 50.0), (1, 40, 90.0)]
 
 
-def test_boots_of_a_log_without_stamps_are_told_apart(tmp_path: Path) -> None:
+def test_boots_of_a_log_without_stamps_are_separate(tmp_path: Path) -> None:
     """That the second one lasts longer made one series of both."""
     codec, data = mavlink.MAVLink(None, 1, 1), bytearray()
     for count, begin_ms in ((100, 10_000), (130, 10_020)):

@@ -26,7 +26,7 @@ class Boxes:
 
 
 def agent_with(detector: Detector | None, said: list[str] | None = None) -> UavAgent:
-    """An agent without connections; what it tells the stations is appended to ``said``."""
+    """An agent without connections; what it sends the stations is appended to ``said``."""
     say = [].append if said is None else said.append
     anything = cast(Any, SimpleNamespace(begin=lambda position: None, say=say, status=TrackingStatus(), info=None))
     vehicle = Vehicle(cast(Link, anything), gimbal=False)
@@ -56,7 +56,7 @@ def test_where_nothing_is_detected_the_box_is_around_the_point() -> None:
         assert (x + 0.5 * width, y + 0.5 * height) == pytest.approx((299.5, 49.5))
 
 
-def test_a_selection_on_a_black_image_is_refused_and_the_stations_are_told() -> None:
+def test_a_selection_on_a_black_image_is_refused_and_stations_get_a_text() -> None:
     said: list[str] = []
     agent = agent_with(None, said)
     agent._take_frame(Frame(np.zeros((480, 640, 3), np.uint8), 0, 10**9), 10**9)
