@@ -11,7 +11,8 @@ from edge.uav.base import Box
 from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.ground.photometric import TargetGain
 from edge.uav.target import footprint
-from edge.uav.target.appearance import AppearanceModel, Candidate, GroundPatch, rectify_patch
+from edge.uav.target.appearance import AppearanceModel, Candidate
+from edge.uav.target.ground_patch import GroundPatch, rectify_patch
 from edge.uav.target.motion_history import MotionFit
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats, Image

@@ -18,8 +18,9 @@ from edge.uav.prediction import occlusion, particle_set
 from edge.uav.prediction.driver_model import DriverModel
 from edge.uav.prediction.particle_set import NO_PATH
 from edge.uav.prediction.paths import RoadPath, road_edges, trace_paths
-from edge.uav.target.appearance import AppearanceModel, Candidate, GroundPatch, rectify_patch
+from edge.uav.target.appearance import AppearanceModel, Candidate
 from edge.uav.target.footprint import corners, footprint_from_box, oriented_rectangle
+from edge.uav.target.ground_patch import GroundPatch, rectify_patch
 from edge.uav.target.likelihood import evaluate_candidates
 from edge.uav.target.motion_history import MotionFit, MotionHistory
 from edge.uav.target.redetection import path_plausibility
