@@ -40,6 +40,9 @@ _MIN_BEYOND, _CENTRED, _CUT_PX = 10, 0.998, 1.5
 as cut ones do; the share of boxes that are then within the picture."""
 _MAX_ROUNDED = 1.1
 """Frames with one time, on average: a clock's stamps may repeat now and then."""
+_STD_PX, _CUT_ACROSS, _CUT_ALONG = 1.5, 0.1, 0.5
+"""Of the middle of a box that the border cuts: as of any detection without a covariance, and over its height, across
+a body of whom half the width may be out of the picture, and along one of whom a third to all is in it."""
 _MAX_EMPTY_PER_FRAME = 20
 """Frames without a row that are added for one with rows. Rarer numbers are labels, not a numbering of the frames."""
 
@@ -260,7 +263,7 @@ def followed_detections(
 
     sizes: (width, height) of each camera's image [px]. A detection without a kind is of this one if it has a box, a
     head or a foot. Where all boxes of a camera end at its image's border, a box that reaches it is cut: the end that
-    is not seen is not given.
+    is not seen is not given, at a side neither of both, and its middle is uncertain.
     """
     left = LeftOut()
     kept = [message for message in messages if message.camera in sizes]
@@ -354,9 +357,14 @@ def _complete(one: pb.Detection, kind: Kind, clip: tuple[int, int] | None) -> No
     one.kind = kind
     if kind == "person" and len(one.box) == 4 and not (one.head or one.foot):
         x, y, width, height = one.box
-        if clip is None or y > 0.5:
+        above, below = clip is not None and y <= 0.5, clip is not None and y + height >= clip[1] - 1.5
+        across = clip is not None and (x <= 0.5 or x + width >= clip[0] - 1.5)
+        if not (across or above):
             one.head.extend([x + 0.5 * width, y])
-        if clip is None or y + height < clip[1] - 1.5:
+        if not (across or below):
             one.foot.extend([x + 0.5 * width, y + height])
+        if (across or above or below) and not one.covariance:
+            u_std, v_std = across * _CUT_ACROSS * height, (above or below) * _CUT_ALONG * height
+            one.covariance.extend([_STD_PX**2 + u_std**2, 0.0, _STD_PX**2 + v_std**2])
     if one.size <= 0.0 and one.head and one.foot:
         one.size = math.dist(one.head, one.foot)
