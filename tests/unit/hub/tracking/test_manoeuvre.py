@@ -11,7 +11,7 @@ import pytest
 from edge.scenes.common.placement import look_at_pose
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter import kalman
-from hub.tracking.filter.kalman import STATE_DIM
+from hub.tracking.filter.kalman import LOG_SIZE, STATE_DIM, VELOCITY
 from hub.tracking.filter.manoeuvre import (
     fused_predictions,
     gpb1_update,
@@ -19,6 +19,7 @@ from hub.tracking.filter.manoeuvre import (
     widened_by_evidence,
     within_reach,
 )
+from hub.tracking.filter.prediction import predict_targets
 from hub.tracking.filter.target_models import KIND_INDEX, MARKER, PERSON
 from hub.tracking.filter.target_states import Targets
 from hub.tracking.parameters import TrackerParameters
@@ -126,6 +127,19 @@ def test_people_set_off_and_stop_along_the_ground_and_sometimes() -> None:
     assert (added[[0, 1, 3, 4]] > 0.0).all()
     assert not added[[2, 5, 6]].any()
     assert 0.0 < manoeuvre.prior_odds[0] < 0.2
+
+
+def test_who_runs_turns_harder_than_who_walks() -> None:
+    """Players of a team sport who turned got a second number; walkers are predicted as before."""
+    still = seen_before("person", 0.0)
+    added = []
+    for speed in (1.0, 2.0, 6.0):
+        mean = still.mean.copy()
+        mean[:, VELOCITY.start], mean[:, LOG_SIZE] = speed, np.log(PERSON.size_m)
+        later = predict_targets(replace(still, mean=mean), 0.5, TrackerParameters())
+        added.append(later.covariance[0, VELOCITY.start, VELOCITY.start] - 1.0)
+    assert added[1] == pytest.approx(added[0])
+    assert added[2] == pytest.approx(9.0 * added[0])
 
 
 def test_who_takes_one_step_and_stands_again_is_no_surprise() -> None:
