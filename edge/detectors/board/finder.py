@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.board.description import Board, load_dictionary
+from edge.detectors.marker.tag import refined_corners
 from protocols.geometry.types import Floats, Ints
 
 Grey = npt.NDArray[np.uint8]
@@ -64,6 +65,8 @@ class Finder:
         numbers, pixels = corners
         if not len(numbers):
             return corners
+        if self.board.tags:
+            return numbers, np.concatenate([refined_corners(grey, quad) for quad in pixels.reshape(-1, 4, 2)])
         share = _SUBPIX_SHARE if self.board.kind == "chessboard" else _SUBPIX_SHARE_OF_TAGS
         half = int(np.clip(share * self.pitch(corners), _SUBPIX_LEAST, _SUBPIX_MOST))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
@@ -105,7 +108,7 @@ class Finder:
             if self.board.squares is not None and labels[0] not in self._numbers:
                 continue  # not of this grid
             numbers += [self._number(label) for label in labels]
-            pixels.append(np.asarray(quad, dtype=np.float64).reshape(4, 2))
+            pixels.append(refined_corners(grey, np.asarray(quad, dtype=np.float64).reshape(4, 2)))
         return (np.array(numbers, dtype=np.int64), np.concatenate(pixels)) if numbers else NOTHING
 
     def _find_chessboard(self, grey: Grey, thorough: bool) -> Corners:
