@@ -162,7 +162,8 @@ def update_calibration(
             _free_parameters(prepared),
         )
         reasons |= unplaced
-    near = not larger_residuals(reconstruction, last.cameras)  # else rows that the last answer explained no longer fit
+    # Else rows that the last answer explained no longer fit, or one has joined whose lens was not tested yet.
+    near = not larger_residuals(reconstruction, last.cameras) and set(reconstruction.names) <= last.cameras.keys()
     reconstruction, failures, misfitting = _adjust_without_failures(
         prepared, reconstruction, refused | reasons, warm=not full and near, refine_lenses=refine_lenses
     )
