@@ -17,6 +17,8 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 
 _TIME_CONSTANT_S = 0.5  # of the offset's mean: longer ones lag behind the drift, shorter ones keep the attitude's noise
+_DRIFT_M_S = 0.1
+"""Std by which the ground frame drifts each second: by metres within half a minute. Of gaps of 8 s it made 0.5 m."""
 _MIN_COSINE = 0.6  # between the ray and straight down: for flatter rays a small tilt error is metres
 _ROLL_PITCH_STD_RAD = 0.005  # of an autopilot's roll and pitch
 _MIN_HEIGHT_M = 2.0  # of the camera: below, an error of the height in metres is as large as the height
@@ -54,7 +56,8 @@ class Georeference:
     def __init__(self, lens: Intrinsics, body_from_camera: Floats) -> None:
         self._lens = lens
         self._telemetry = TelemetryTrack(np.asarray(body_from_camera))
-        self._last_s = -math.inf
+        self._centre: Floats | None = None
+        self._last_s = self._measured_s = -math.inf
         self.offset: Floats | None = None
 
     def add(self, sample: Telemetry) -> None:
@@ -63,7 +66,7 @@ class Georeference:
 
     def reset(self) -> None:
         """Start over for another target, whose ground frame is new."""
-        self.offset = None
+        self.offset = self._centre = None
         self._last_s = -math.inf
 
     def locate(self, x: float, y: float, time: float) -> Floats | None:
@@ -87,9 +90,13 @@ class Georeference:
             difference = measured - place
             gain = 1.0 if self.offset is None else -math.expm1(-max(time - self._last_s, 0.0) / _TIME_CONSTANT_S)
             self.offset = difference if self.offset is None else self.offset + gain * (difference - self.offset)
+            self._measured_s = time
         self._last_s = time
         if self.offset is not None:
             place = place + self.offset
         centre = self._telemetry.position_at(time)
-        std_m = estimate.std_m if centre is None else math.hypot(estimate.std_m, _ground_std(place, centre))
+        self._centre = centre = self._centre if centre is None else centre
+        drift = 0.0 if self.offset is None else _DRIFT_M_S * (time - self._measured_s)
+        ground = 0.0 if centre is None else _ground_std(place, centre)
+        std_m = math.hypot(estimate.std_m, ground, drift)
         return replace(estimate, north=float(place[0]), east=float(place[1]), std_m=std_m)

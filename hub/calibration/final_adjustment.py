@@ -34,7 +34,7 @@ def _with_clock_steps(problem: Problem, state: AdjustmentState) -> tuple[Problem
         problem, state, _ = adjust(problem, state, rounds=2)
         trial, found = _with_sizes(problem, state, step)
         supported = all(clock_steps.is_step_supported(problem, one) for one in found.clock_steps)
-        if not supported or not _bic_prefers(trial, found, problem, state, 2):
+        if not supported or not bic_prefers(trial, found, problem, state, 2):
             break
         problem, state = trial, found
     return problem, state
@@ -56,7 +56,7 @@ def _with_fewer_steps(
     same = (ClockStep(last, float(state.cameras[last].camera_time(one)[0]), size, np.inf, 0.0) for one in times)
     best = max((_with_sizes(*even, one) for one in same), key=lambda tried: _gain(tried[0], tried[1], *even)[0])
     supported = clock_steps.is_step_supported(best[0], best[1].clock_steps[-1])
-    return found if not supported or _bic_prefers(*found, *best, 2 * (len(steps) - 1)) else best
+    return found if not supported or bic_prefers(*found, *best, 2 * (len(steps) - 1)) else best
 
 
 def _steps_or_rates(
@@ -156,7 +156,7 @@ def final_adjustment(
         report("adjusting the lenses", 0.85)
         freed = replace(problem, free_parameters=replace(problem.free_parameters, lens=True))
         freed_problem, freed_state, _ = adjust(freed, state, rounds=2, progress=lambda text: report(text, 0.85))
-        if _bic_prefers(freed_problem, freed_state, problem, state, 2 * len(state.cameras)):
+        if bic_prefers(freed_problem, freed_state, problem, state, 2 * len(state.cameras)):
             problem, state = freed_problem, freed_state
     adjusted = replace(reconstruction, problem=problem, state=state)
     if misfits(adjusted) or wrong_lens(problem, state):
@@ -186,7 +186,7 @@ def _refit_online(problem: Problem, state: AdjustmentState, refine_lenses: bool)
     return (problem, state) if refitted[1] is state else refitted
 
 
-def _bic_prefers(
+def bic_prefers(
     freed: Problem, freed_state: AdjustmentState, fixed: Problem, fixed_state: AdjustmentState, parameters: int
 ) -> bool:
     """Whether ``parameters`` more are justified (Bayesian information criterion).
@@ -203,10 +203,10 @@ def _gain(
     """By how much the deviance is less, and the effective rows."""
     inflation = correlation_inflation(freed, freed_state)
     rows = sum(len(part.time) / inflation[part.camera] for part in fixed.rows)
-    return float(((_deviances(fixed, fixed_state) - _deviances(freed, freed_state)) / inflation).sum()), float(rows)
+    return float(((deviances(fixed, fixed_state) - deviances(freed, freed_state)) / inflation).sum()), float(rows)
 
 
-def _deviances(problem: Problem, state: AdjustmentState) -> Floats:
+def deviances(problem: Problem, state: AdjustmentState) -> Floats:
     """(cameras,) twice the negative logarithm of the likelihood of each camera's rows."""
     total = np.zeros(len(state.cameras))
     for part in problem.rows:

@@ -26,7 +26,7 @@ from hub.bundle.initialisation import (
 from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import LARGE_NETWORK, CameraState, ClockStep, FreeParameters
 from hub.calibration.acceptance import larger_residuals, misfits, network_failure
-from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, final_adjustment
+from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, bic_prefers, deviances, final_adjustment
 from hub.calibration.pairs.moved_pair import LEAST_SIDE_S, PairDivision, find_division, time_map_between
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pipeline import calibrate
@@ -162,7 +162,8 @@ def update_calibration(
             _free_parameters(prepared),
         )
         reasons |= unplaced
-    near = not larger_residuals(reconstruction, last.cameras)  # else rows that the last answer explained no longer fit
+    # Else rows that the last answer explained no longer fit, or one has joined whose lens was not tested yet.
+    near = not larger_residuals(reconstruction, last.cameras) and set(reconstruction.names) <= last.cameras.keys()
     reconstruction, failures, misfitting = _adjust_without_failures(
         prepared, reconstruction, refused | reasons, warm=not full and near, refine_lenses=refine_lenses
     )
@@ -282,6 +283,7 @@ def _with_clock_steps(
         return prepared, _warm_start(prepared, _initial_states(prepared, last, tied, measured_lenses=full))
 
     prepared, reconstruction = start(steps, last)
+    before = steps, last, (prepared, reconstruction)
     for _ in range(MAX_CLOCK_STEPS + 1 if further else 0):
         found = _clock_step(steps, prepared, reconstruction)
         if found is None:
@@ -292,10 +294,28 @@ def _with_clock_steps(
             break  # a move of one of two cameras would look alike yet
         trial_steps, trial_last = with_step(steps, name, step), with_clock_set(last, name, step[1])
         trial = start(trial_steps, trial_last)
-        if trial[1].names != reconstruction.names or not _are_supported(trial_steps, *trial):
+        supported = _supported_steps(trial_steps, *trial) if trial[1].names == reconstruction.names else None
+        if supported is None:
             break
-        steps, last, (prepared, reconstruction) = trial_steps, trial_last, trial
+        steps, last, (prepared, reconstruction) = supported, trial_last, trial
+    # Of two points with one label a step explains the few rows of the second one; the others, rejected, do not speak.
+    if reconstruction is not before[2][1] and not _explain_more(steps, reconstruction, before[0], before[2][1]):
+        steps, last, (prepared, reconstruction) = before
     return on_newest_clock(observations, steps), last, (prepared, reconstruction), steps
+
+
+def _explain_more(
+    steps: Mapping[str, tuple[Step, ...]],
+    found: Reconstruction,
+    known: Mapping[str, tuple[Step, ...]],
+    old: Reconstruction,
+) -> bool:
+    """Whether all rows, also rejected ones, fit better with ``steps`` than with those ``known``, and those of the
+    cameras that step by themselves."""
+    gain = deviances(old.problem, old.state) - deviances(found.problem, found.state)
+    own = sum(gain[i] for i, name in enumerate(found.names) if steps.get(name) != known.get(name))
+    parameters = 2 * (sum(map(len, steps.values())) - sum(map(len, known.values())))
+    return own > 0.0 and bic_prefers(found.problem, found.state, old.problem, old.state, parameters)
 
 
 def _clock_step(
@@ -328,14 +348,20 @@ def _remaining_steps(
             yield scale, step, clock_steps.remaining_step(reconstruction.problem, reconstruction.state, number, at)
 
 
-def _are_supported(
+def _supported_steps(
     steps: Mapping[str, tuple[Step, ...]], prepared: PreparedSession, reconstruction: Reconstruction
-) -> bool:
-    """Whether all steps are as large as a step has to be, in the adjustment to the rows on the corrected clocks."""
-    return all(
-        clock_steps.is_step_supported(reconstruction.problem, replace(left, size=scale * step[1] + left.size))
-        for scale, step, left in _remaining_steps(steps, prepared, reconstruction)
-    )
+) -> dict[str, tuple[Step, ...]] | None:
+    """The steps, each with a std, if all are as large as a step has to be in the adjustment to the corrected rows."""
+    stds = dict[tuple[str, float], float]()
+    for scale, step, left in _remaining_steps(steps, prepared, reconstruction):
+        whole = replace(left, size=scale * step[1] + left.size)
+        if not clock_steps.is_step_supported(reconstruction.problem, whole):
+            return None
+        stds[reconstruction.names[left.camera], step[0]] = left.std / scale
+    return {
+        name: tuple((at, size, std if np.isfinite(std) else stds[name, at]) for at, size, std in known)
+        for name, known in steps.items()
+    }
 
 
 def _with_steps(found: Calibration, steps: Mapping[str, tuple[Step, ...]]) -> Calibration:

@@ -75,7 +75,7 @@ def assemble_calibration(
     order = [reconstruction.names.index(name) for name in rig.cameras if name in reconstruction.names]
     names = [reconstruction.names[i] for i in order]
     problem, state = _reordered(reconstruction.problem, reconstruction.state, order)
-    reference = _reference_index(rig, names)
+    reference = _reference_index(rig, names, published)
     control_outliers: tuple[str, ...] = ()
     datum_points: list[tuple[int, Floats]] = []
     if solution.known is None:
@@ -245,9 +245,14 @@ def _internal_time(
     return internal
 
 
-def _reference_index(rig: Rig, names: list[str]) -> int:
+def _reference_index(rig: Rig, names: list[str], published: Calibration | None) -> int:
+    """The camera on whose clock the answer is: the requested one, or one that ``published`` has a map of.
+
+    Only such a one leads to the published reference clock; that of a camera that was restarted began anew.
+    """
+    known = [name for name in names if published is None or name in published.cameras] or names
     requested = rig.metadata.get("reference")
-    return names.index(requested) if requested in names else 0
+    return names.index(requested if requested in known else known[0])
 
 
 def _reordered(problem: Problem, state: AdjustmentState, order: list[int]) -> tuple[Problem, AdjustmentState]:

@@ -156,13 +156,13 @@ def stated_calibration(rig: Rig, cameras: dict[str, CameraCalibration]) -> Calib
 
 
 def on_present_clock(calibration: Calibration) -> Calibration:
-    """The calibration on the clock of one of its cameras, where the reference camera is none of them any more.
+    """The calibration on the clock of one of its cameras, where the reference clock is none of theirs any more.
 
-    A hub holds its reference clock when that camera has gone; a file's reference clock has to be one of its cameras'.
+    A hub holds its reference clock when that camera has gone or was restarted; a file's has to be one of its cameras'.
     The new one is the camera whose lag is known best, as of which the others' stds are.
     """
-    cameras = calibration.cameras
-    if calibration.reference in cameras or not cameras:
+    cameras, reference = calibration.cameras, calibration.cameras.get(calibration.reference)
+    if not cameras or (reference is not None and reference.time_map == TimeMap(clock_rate=1.0, time_offset=0.0)):
         return calibration
     name = min(cameras, key=lambda one: cameras[one].time_offset_std)
     base, std = cameras[name].time_map, cameras[name].time_offset_std

@@ -17,6 +17,8 @@ from protocols.geometry.types import Floats
 
 MAX_POSITION_AGE_S = 1.5
 """For how long a position is extrapolated at its velocity: one sent each second may be late."""
+_SMOOTH_S = 0.5
+"""For how long a vehicle flies on nearly straight: at 3 m/s² it is 0.4 m from there by then, after 1.5 s 3.4 m."""
 _MAX_LOCAL_AGE_S = 2.0  # without a local position, after which the global one is used
 _ON_GROUND_S = 3.0  # after arming, when home is set: a heartbeat may say so first, and no vehicle is high by then
 _STEP_M, _STEP_DOWN_M = 3.0, 0.5  # from which the frame has moved: 0.15 s at 20 m/s, and at a climb of 3 m/s
@@ -35,6 +37,7 @@ class LocalFrame:
         self.position: tuple[float, Floats, Floats] | None = None
         self._shift = np.zeros(3)  # from reported local positions into this frame
         self._local_s: float | None = None
+        self._interval_s = MAX_POSITION_AGE_S  # between the last two reports
         self._armed_s: float | None = None
 
     def set_armed(self, armed: bool, time: float) -> None:
@@ -53,6 +56,13 @@ class LocalFrame:
         last, position, velocity = self.position
         return np.asarray(position + (time - last) * velocity), velocity
 
+    def measured_at(self, time: float) -> Floats | None:
+        """Position (3,) at a time; None where a report is missing, from which on `at` is a guess."""
+        if self.position is None or abs(time - self.position[0]) >= max(2.0 * self._interval_s, _SMOOTH_S):
+            return None
+        known = self.at(time)
+        return None if known is None else known[0]
+
     def take_local(self, report: LocalPosition, time: float) -> None:
         """Add a local position. A jump that its velocity does not explain is one of its frame, until a global one."""
         expected = self.at(time)
@@ -64,7 +74,7 @@ class LocalFrame:
         if np.abs(report.position + self._shift).max() > MAX_DISTANCE_M:
             self._shift = np.zeros(3)
         self._local_s = time
-        self.position = time, report.position + self._shift, report.velocity
+        self._report(time, report.position + self._shift, report.velocity)
 
     def take_global(self, report: GlobalPosition, time: float) -> None:
         """Add a global position."""
@@ -82,9 +92,13 @@ class LocalFrame:
             last, velocity = self.position, report.velocity
             if last is not None and not velocity.any() and 0.0 < time - last[0] < 2 * MAX_POSITION_AGE_S:
                 velocity = (position - last[1]) / (time - last[0])  # Betaflight sends 0 in place of it
-            self.position = time, position, velocity
+            self._report(time, position, velocity)
         else:
             self._correct(position - local[0], 0.0)
+
+    def _report(self, time: float, position: Floats, velocity: Floats) -> None:
+        self._interval_s = MAX_POSITION_AGE_S if self.position is None else time - self.position[0]
+        self.position = time, position, velocity
 
     def _correct(self, lacking: Floats, slack_m: float, *, across: bool = True) -> None:
         """Move the frame by what its positions lack (3,) [m], if that is a step of the frame. across: also sideways."""

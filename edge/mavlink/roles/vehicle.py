@@ -44,7 +44,7 @@ class MountSample:
     """A telemetry sample. host_ns, vehicle_ns: time of measurement on the host's and the autopilot's clock.
 
     std_s: of host_ns. ned_from_mount: (3, 3) of the camera's mount (airframe or gimbal). position: (3,) NED [m] from
-    the vehicle's ``origin``, None where unknown. velocity: (3,) NED [m/s].
+    the vehicle's ``origin``, None where no report was due so near that it is known.
     """
 
     host_ns: int
@@ -52,7 +52,6 @@ class MountSample:
     std_s: float
     ned_from_mount: Floats
     position: Floats | None
-    velocity: Floats | None
 
 
 class Vehicle:
@@ -240,7 +239,7 @@ class Vehicle:
         if self._sample_s != _NEVER:
             self._spacing_s += 0.2 * (min(time - self._sample_s, _MISSING_AFTER_S) - self._spacing_s)
         self._sample_s = time
-        position, velocity = self.motion_at(time) or (None, None)
+        position = self.frame.measured_at(time)
         vehicle_ns = host_ns + (self.clock.offset_ns if self.clock.known else clock.offset_ns)
-        self.mount = MountSample(host_ns, vehicle_ns, clock.std_s, rotation, position, velocity)
+        self.mount = MountSample(host_ns, vehicle_ns, clock.std_s, rotation, position)
         return [self.mount]

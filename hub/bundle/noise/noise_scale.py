@@ -91,7 +91,10 @@ def rescale_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPri
     found, none = covariance(problem, state, prior, longest=True), np.zeros(len(state.cameras))
     # A camera's redundancy follows from few rows of it, and many cameras that see a label cost each of them more.
     most_rows = _MAX_ROWS if len(none) <= LARGE_NETWORK else _MAX_ROWS_IN_ROUNDS
-    noise = _over_redundancy(residual_std(problem, state), problem, state, found, none, most_rows)
+    # Where frames have times of their own, these absorb the residuals along the motion: ``sigma`` is that across it.
+    jitters = [any(rows.along_std is not None for rows in problem.of_camera(camera)) for camera in range(len(none))]
+    noise = np.where(jitters, state.sigma, residual_std(problem, state))
+    noise = _over_redundancy(noise, problem, state, found, none, most_rows)
     modelled = [modelled_inflation(problem, state, camera) for camera in range(len(state.cameras))]
     return replace(state, sigma=noise * np.sqrt(np.maximum(correlation_inflation(problem, state), modelled)))
 

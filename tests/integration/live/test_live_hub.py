@@ -112,6 +112,69 @@ def test_a_restarted_camera_has_another_clock(session: Session) -> None:
         assert np.ptp(track.time) < 30.0
 
 
+def test_a_restarted_reference_camera_leaves_the_reference_clock_as_it_is(session: Session, tmp_path: Path) -> None:
+    """The clock went back to that of the new run, and nothing was tracked until it had caught up."""
+    first, again = messages(session), messages(session, boot="boot1", shift_s=-5000.0)
+    begin = len(first) // 2
+    # cam0 alone has the other boot id from there on: the stream of a rig whose reference camera was restarted.
+    rest = [new if new.camera == "cam0" else old for old, new in zip(first, again, strict=True)]  # type: ignore[attr-defined]
+    hub, step = LiveHub(SETTINGS), 50
+    stream = first[:begin] + rest[:3] + rest[begin:]
+    tracks: list[pb.Track] = []
+    for tick, at in enumerate(range(0, len(stream), step)):
+        for message in stream[at : at + step]:
+            hub.handle(message)
+        out = hub.tick(10.0 * tick)
+        tracks += [message for message in out if isinstance(message, pb.Track)]
+        if at < begin <= at + step:
+            assert hub.calibration is not None
+            before = hub.calibration
+    assert hub.calibration is not None
+    assert set(hub.calibration.cameras) == set(before.cameras) == {"cam0", "cam1", "cam2"}
+    assert hub.boot_ids["cam0"] == "boot1"
+    for name in ("cam1", "cam2"):
+        now, then = hub.calibration.cameras[name], before.cameras[name]
+        at_s = CameraTime(then.lag_time)
+        moved = now.time_map.reference_from_camera(at_s) - then.time_map.reference_from_camera(at_s)
+        assert abs(moved) < 0.01, "the clock of before"
+    times = [one.reference_time_ns / NANOSECONDS for one in tracks if one.state == "confirmed"]
+    newest = session.time[session.of_camera("cam0")].max()
+    assert times[-1] > newest - 2.0, "tracked to the end"
+    store = AnswerStore(tmp_path)
+    assert hub.session is not None
+    store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.links.delays)
+    store.close()
+    kept = AnswerStore(tmp_path).load()
+    assert kept is not None
+    base = kept[0].cameras[kept[0].reference].time_map
+    assert (base.clock_rate, base.time_offset) == (1.0, 0.0), "a file's reference clock is one of its cameras'"
+
+
+def test_a_camera_whose_lens_is_refuted_does_not_come_back_with_every_search() -> None:
+    """Joined again, its lens was not tested before the next full search: in and out, at a wrong place."""
+    session = simulate(73, 5, 40)
+    hub, out, stream = LiveHub(SETTINGS), list[Message](), list[tuple[float, pb.Observation]]()
+    for message in messages(session):
+        if isinstance(message, pb.Observation):
+            clock = session.clocks[message.camera]
+            sent = clock.reference_from_camera(CameraTime(message.device_time_ns / NANOSECONDS))
+            stream.append((float(sent) + 0.03, message))
+        elif isinstance(message, pb.CameraInfo):
+            if message.camera == "cam3":
+                message.matrix[0], message.matrix[4] = 1.15 * message.matrix[0], 1.15 * message.matrix[4]
+            hub.handle(message)
+    stream.sort(key=lambda sent: sent[0])
+    for number, (arrival, message) in enumerate(stream):
+        hub.handle(message, arrival)
+        if number % 200 == 199:
+            out += hub.tick(arrival - stream[0][0])
+    found = [one for one in calibrations(out) if one.status == "solved"]
+    refuted = [any(each.camera == "cam3" for each in one.refused) for one in found]
+    assert all(refuted[refuted.index(True) :])
+    assert len(found) - refuted.index(True) > 5
+    assert "lens is refuted" in found[-1].refused[0].reason
+
+
 def test_of_a_long_recording_the_intervals_with_shared_motion_are_kept() -> None:
     """Ten seconds of motion, then a target at rest: what moved is kept, the rest only as far as it is new."""
     builder = SessionBuilder(window_s=20.0)

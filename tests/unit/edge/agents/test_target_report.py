@@ -31,7 +31,7 @@ def fov_status(
     gimbal: np.ndarray | None, position: np.ndarray | None = CENTRE, lens: Intrinsics | None = LENS, age_ns: int = 0
 ) -> Any:
     """CAMERA_FOV_STATUS of a camera on a gimbal with rotation ned_from_gimbal."""
-    mount = None if gimbal is None else MountSample(NOW - age_ns, NOW, 0.01, gimbal, position, np.zeros(3))
+    mount = None if gimbal is None else MountSample(NOW - age_ns, NOW, 0.01, gimbal, position)
     motion = None if position is None else (position, np.zeros(3))
     vehicle = SimpleNamespace(origin=ORIGIN, motion_at=lambda time_s: motion, mount=mount)
     ours, theirs = Pipe.pair()

@@ -61,6 +61,16 @@ def test_outside_the_image_the_last_correction_is_kept() -> None:
     assert (kept.north, kept.east, kept.std_m) == (100.0, 50.0, far.std_m)
 
 
+def test_without_positions_the_std_does_not_fall_but_grows() -> None:
+    """Between rare attitudes, and while no positions came, it fell to the tracker's own: 0.2 m where 1.3 m were off."""
+    georeference = Georeference(LENS, BODY_FROM_DOWN_CAMERA)
+    measured = simulate_flight(1.0, np.array([6.0, -3.0]), georeference)
+    estimate = estimate_at(300.0, 200.0, *(CAR[:2] + [6.0, -3.0]))
+    soon, later = (georeference.corrected(estimate, time).std_m for time in (1.5, 9.0))
+    assert soon == pytest.approx(measured.std_m, rel=0.05)
+    assert 0.7 < later < 1.5
+
+
 def test_no_correction_without_telemetry_metric_ground_or_a_steep_ray() -> None:
     georeference = Georeference(LENS, BODY_FROM_DOWN_CAMERA)
     estimate = estimate_at(320.0, 240.0, 1.0, 2.0)

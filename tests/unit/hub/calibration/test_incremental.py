@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hub.bundle import clock_steps
+from hub.bundle.problem import ClockStep
 from hub.calibration.incremental import update_calibration
 from hub.calibration.pipeline import calibrate
 from hub.clocks.arrival_prior import ERROR_BOUND_S, ArrivalPriors
@@ -274,6 +276,16 @@ def test_a_clock_step_inside_the_window_is_recognised_and_the_map_is_that_after_
     ((when, found, std),) = last.cameras[camera].clock_steps
     assert abs(when - at) < 0.7
     assert abs(found - size) < 4.0 * std < 4e-3
+
+
+def test_a_step_that_only_rejected_rows_ask_for_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a second point with the same label: the rows that it moved away were rejected, and lags 30 to 115 ms off."""
+    session = simulate(3, 4, 30)
+    last = update_calibration(session.rig, until(session, 25.0), None).calibration
+    false = [ClockStep(0, 2.0, 0.06, np.inf, 1e4)]
+    monkeypatch.setattr(clock_steps, "find_clock_step", lambda problem, state: false.pop() if false else None)
+    found = update_calibration(session.rig, session.observations(), last, full=False, search=False).calibration
+    assert not any(one.clock_steps for one in found.cameras.values())
 
 
 def test_the_first_answer_of_a_window_with_a_clock_step_holds_after_it() -> None:
