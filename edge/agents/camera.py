@@ -21,10 +21,9 @@ from edge.agents.publish_queue import PublishQueue
 from edge.agents.thumbnails import THUMBNAIL_WIDTH, thumbnail_message
 from edge.detectors.base import Detection, Detector, Prediction
 from edge.devices.base import Device, Frame, HasTemperature, Reconnecting
-from protocols.bus.base import Bus, Subscription
+from protocols.bus.base import Bus, Subscription, agent_status
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
-from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import RigCamera
 from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE, PREDICTION, STATUS, Topic
@@ -291,18 +290,7 @@ class CameraAgent:
             span = (recent[-1][0] - recent[0][0]) / NANOSECONDS
             gauges["fps"] = (len(recent) - 1) / span if span > 0 else 0.0
             gauges["latency_s"] = sorted(latency for _, latency in recent)[len(recent) // 2]
-        return pb.AgentStatus(
-            schema_version=SCHEMA_VERSION,
-            agent=self._camera,
-            role=ROLE,
-            boot_id=self.boot_id,
-            sequence=sequence,
-            state=state,
-            message=text,
-            counters=counters,
-            gauges=gauges,
-            version=VERSION,
-        )
+        return agent_status(ROLE, self._camera, self.boot_id, sequence, state, text, counters, gauges)
 
 
 def add_rig_pose(message: pb.CameraInfo, known: RigCamera) -> None:

@@ -12,16 +12,15 @@ from typing import NoReturn
 
 import msgspec
 
+from protocols.bus.base import agent_status
 from protocols.bus.router.canary import DEAD_AFTER_S, Canary
 from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, split_endpoint
 from protocols.bus.transport.session import close_session, open_session, zenoh_call
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.closing import Closing
 from protocols.core.names import key_segment
-from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS
-from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "router"
 _TICK_S = 0.1  # several looks at the canary in DEAD_AFTER_S
@@ -96,17 +95,10 @@ def run_router(
             now = time.monotonic()
             if now >= next_status:
                 next_status = now + _STATUS_S
-                status = pb.AgentStatus(
-                    schema_version=SCHEMA_VERSION,
-                    agent=agent,
-                    role=ROLE,
-                    boot_id=boot,
-                    state="running" if passing else "starting",
-                    message=f"relays, {canary.delay_s * 1e3:.1f} ms",
-                    counters={"restarts": restarts, "canary": canary.heard},
-                    gauges={"canary_s": canary.delay_s, "sessions": router.sessions()},
-                    version=VERSION,
-                )
+                state, text = "running" if passing else "starting", f"relays, {canary.delay_s * 1e3:.1f} ms"
+                counters = {"restarts": restarts, "canary": canary.heard}
+                gauges = {"canary_s": canary.delay_s, "sessions": router.sessions()}
+                status = agent_status(ROLE, agent, boot, 0, state, text, counters, gauges)
                 seen(status)
                 publisher.put(status)
         publisher.close()
