@@ -251,12 +251,10 @@ class CameraAgent:
         if lens is not None and (lens.width, lens.height) != (info.width, info.height) and info.intrinsics is not None:
             lens = info.intrinsics  # the images are smaller than those the rig file was calibrated for
         if lens is not None:
-            message.matrix.extend(lens.matrix.ravel().tolist())
-            message.distortions.extend(lens.distortions.tolist())
-            message.fisheye = lens.fisheye
+            message.MergeFrom(pb.CameraInfo(**lens.message_fields()))
         if known is not None:
             message.focal_std = known.focal_std if lens is known.intrinsics else 0.0
-            add_rig_pose(message, known)
+            message.MergeFrom(pb.CameraInfo(**known.pose_table()))
         return message
 
     def _status(self, state: str, text: str, sequence: int, out_queue: PublishQueue) -> pb.AgentStatus:
@@ -291,21 +289,6 @@ class CameraAgent:
             gauges["fps"] = (len(recent) - 1) / span if span > 0 else 0.0
             gauges["latency_s"] = sorted(latency for _, latency in recent)[len(recent) // 2]
         return agent_status(ROLE, self._camera, self.boot_id, sequence, state, text, counters, gauges)
-
-
-def add_rig_pose(message: pb.CameraInfo, known: RigCamera) -> None:
-    """Copy a camera's pose and its uncertainty from the rig file into the message; lengths in the rig's units."""
-    for field, values in (
-        (message.position, known.position),
-        (message.position_std, known.position_std),
-        (message.rotation_std, known.rotation_std),
-    ):
-        if values is not None:
-            field.extend(values.tolist())
-    if known.rotation is not None:
-        from protocols.geometry import so3
-
-        message.rotation.extend(so3.log(known.rotation).tolist())
 
 
 def detection_message(detection: Detection) -> pb.Detection:

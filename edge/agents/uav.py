@@ -182,9 +182,7 @@ class UavAgent:
             model=settings.model,
         )
         if settings.lens is not None:
-            message.matrix.extend(settings.lens.matrix.ravel().tolist())
-            message.distortions.extend(settings.lens.distortions.tolist())
-            message.fisheye = settings.lens.fisheye
+            message.MergeFrom(pb.UavInfo(**settings.lens.message_fields()))
         if settings.body_from_camera is not None:
             message.body_from_camera.extend(np.asarray(settings.body_from_camera).ravel().tolist())
         return message

@@ -192,7 +192,5 @@ def _info(calibration: Calibration, name: str) -> pb.CameraInfo:
         width=lens.width,
         height=lens.height,
         driver="calibration.toml",
-        matrix=lens.matrix.ravel().tolist(),
-        distortions=lens.distortions.tolist(),
-        fisheye=lens.fisheye,
+        **lens.message_fields(),
     )
