@@ -31,11 +31,9 @@ from hub.bundle.problem import (
     K1,
     RATE,
     AdjustmentState,
-    LensPrior,
     Problem,
 )
 from hub.bundle.smoothness_prior import estimate_smoothness
-from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Ints
 from protocols.session.rig import MAX_READOUT_S
 
@@ -123,7 +121,11 @@ def mirrored_axis(problem: Problem, state: AdjustmentState) -> str:
 
 def _with_any_lens(problem: Problem, state: AdjustmentState) -> LinearisedModel:
     """The model with all lenses free, its noise scaled to the effective sample size."""
-    freed = replace(problem, lens_tolerances=tuple(map(_any_lens, problem.nominal)))
+    # So wide that only the observations count.
+    wide = [
+        replace(lens_tolerance(one), focal_std=0.5, centre_std=0.5 * one.width, k1_std=0.5) for one in problem.nominal
+    ]
+    freed = replace(problem, lens_tolerances=tuple(wide))
     modelled = [modelled_inflation(problem, state, camera) for camera in range(len(state.cameras))]
     inflation = np.maximum(correlation_inflation(problem, state), modelled)
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
@@ -165,11 +167,6 @@ def _refuted_lenses(
             believed = trial
         if len(believed) == len(found):
             return found
-
-
-def _any_lens(lens: Intrinsics) -> LensPrior:
-    """A prior so wide that only the observations count."""
-    return replace(lens_tolerance(lens), focal_std=0.5, centre_std=0.5 * lens.width, k1_std=0.5)
 
 
 def _forward_selection(

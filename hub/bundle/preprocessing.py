@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -77,8 +76,10 @@ class PreparedSession:
         )
         for name in names:
             camera = self.camera(name)
-            scaled = replace(camera, tracks=_scaled(camera.tracks, factor))
-            (cameras if name in cameras else uncalibrated)[name] = scaled
+            tracks = {
+                k: one.scaled(factor) if isinstance(one, SmoothTrack) else one for k, one in camera.tracks.items()
+            }
+            (cameras if name in cameras else uncalibrated)[name] = replace(camera, tracks=tracks)
             if name in rows:
                 rows[name] = [replace(part, time=part.time * factor, stamp=part.stamps * factor) for part in rows[name]]
             time_scales[name] = self.time_scale(name) * factor
@@ -223,7 +224,3 @@ def nominal_intrinsics(camera: RigCamera) -> Intrinsics:
     focal = float(max(camera.size))
     matrix = np.array([[focal, 0.0, 0.5 * (width - 1)], [0.0, focal, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
     return Intrinsics(width, height, matrix)
-
-
-def _scaled(tracks: Mapping[str, ImageTrack], factor: float) -> dict[str, ImageTrack]:
-    return {label: track.scaled(factor) if isinstance(track, SmoothTrack) else track for label, track in tracks.items()}

@@ -415,13 +415,10 @@ def _lens(camera: CameraView) -> Intrinsics | None:
     found, info = camera.calibration, camera.info
     if found is None or len(found.matrix) != 9:
         return None
-    size = (info.width, info.height) if info is not None else _guessed_image_size(found.matrix)
+    matrix = found.matrix  # its principal point is in the middle, where the size is unknown
+    guess = max(round(2 * matrix[2] + 1), 1), max(round(2 * matrix[5] + 1), 1)
+    size = guess if info is None else (info.width, info.height)
     return Intrinsics.of_message(found, size)
-
-
-def _guessed_image_size(matrix: Any) -> tuple[int, int]:
-    """The image size where it is unknown, assuming the principal point at the centre."""
-    return max(round(2 * matrix[2] + 1), 1), max(round(2 * matrix[5] + 1), 1)
 
 
 def _field_of_view(camera: CameraView) -> tuple[float, float]:

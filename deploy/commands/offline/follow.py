@@ -172,12 +172,9 @@ def follow(
         used = f"{100 * camera.used:.0f} % used"
         lines.append(f"{name}: {camera.frames} frames, {camera.detections} detections, {used}")
     if scores is not None:
-        lines.append(", ".join(f"{name.upper()} {_shown(scores[name])}" for name in ("moda", "mota", "idf1", "hota")))
+        values = {name.upper(): scores[name] for name in ("moda", "mota", "idf1", "hota")}
+        lines.append(", ".join(f"{name} {'-' if value is None else f'{value:.3f}'}" for name, value in values.items()))
     return answer(document, [*lines, *closing_lines(warnings, written)], json)
-
-
-def _shown(value: float | int | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
 
 
 def _cpu_seconds() -> float:

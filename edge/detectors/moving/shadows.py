@@ -76,7 +76,8 @@ class ShadowDetector:
         candidates = np.asarray(all_three, dtype=np.uint8)
         light = np.asarray(attenuation, dtype=np.float32)
         hidden, shown = _texture_test(bright_now, bright_then, light, candidates, raised == 0)
-        self._learn(light[(shown & raised) > 0])
+        seen = np.histogram(light[(shown & raised) > 0], _BINS, _ATTENUATION)[0]
+        self._seen = _FORGETTING * self._seen + seen
         certain = cv2.subtract(candidates, hidden)
         # At the rim of a body its pixels are in the window: there every pixel is tested by itself.
         similar = cv2.subtract(cv2.inRange(cv2.absdiff(now, dimmed), (0, 0, 0), (_PIXEL_COLOUR_STEP,) * 3), hidden)
@@ -84,9 +85,6 @@ class ShadowDetector:
         full = cv2.resize(cv2.bitwise_or(certain, rim), (w, h), interpolation=cv2.INTER_NEAREST)
         shadow[part] = cv2.bitwise_and(full, foreground[part])
         return shadow
-
-    def _learn(self, light: npt.NDArray[np.float32]) -> None:
-        self._seen = _FORGETTING * self._seen + np.histogram(light, _BINS, _ATTENUATION)[0]
 
 
 def _texture_test(

@@ -18,7 +18,10 @@ _MIN_PLACES = 30  # a robust std of fewer is off by more than an eighth
 
 def check_stature(trajectories: Iterable[TrajectoryTable]) -> None:
     """Raise Refused where the distance between the points ``NAME-head`` and ``NAME-foot`` varies along the path."""
-    found = {table.label: (table.time[good], table.position[good]) for table in trajectories for good in [_seen(table)]}
+    found = {}
+    for table in trajectories:
+        seen = np.isfinite(table.position).all(axis=1)
+        found[table.label] = table.time[seen], table.position[seen]
     for label, (times, foot) in found.items():
         name, _, end = label.rpartition("-")
         if end != "foot" or not name or f"{name}-head" not in found or not len(times):
@@ -36,7 +39,3 @@ def check_stature(trajectories: Iterable[TrajectoryTable]) -> None:
                 f"{name} would be {100.0 * variation:.0f} % taller and smaller along the path (std): the geometry is "
                 "wrong; measure the lenses, or let somebody walk nearer and through more of each picture"
             )
-
-
-def _seen(table: TrajectoryTable) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    return np.asarray(np.isfinite(table.position).all(axis=1))

@@ -186,7 +186,8 @@ def _trajectories(
     rate = max([1.0 / fastest, *(rig.cameras[name].fps for name in solution.names)])
     out = []
     owner = {label: (number, point) for number, body in enumerate(rig.bodies.values()) for label, point in body.items()}
-    order = {number: i for i, number in enumerate(_moving_bodies(solution))}
+    seen = sorted({int(number) for views in solution.problem.views for number in np.unique(views.body)})
+    order = {number: i for i, number in enumerate(seen)}
     for number, place in order.items():
         motion = state.bodies[place]
         within = SEEN_WITHIN_S
@@ -211,11 +212,6 @@ def _trajectories(
                 std = world.scale * path.point_stds(point, inside)
                 out.append(TrajectoryTable(label, time, world.points(position[finite]), std))
     return tuple(out)
-
-
-def _moving_bodies(solution: BodySolution) -> list[int]:
-    """Numbers of the bodies that have a motion: those that were seen."""
-    return sorted({int(number) for views in solution.problem.views for number in np.unique(views.body)})
 
 
 def _observed(problem: BodyProblem, state: BodyState, label: int) -> list[Floats]:

@@ -10,7 +10,6 @@ import numpy as np
 from hub.bundle.preprocessing import nominal_intrinsics
 from hub.bundle.problem import FOCAL, OFFSET
 from hub.calibration.rigid_body.adjustment import adjust_bodies
-from hub.calibration.rigid_body.lag import BodyPair
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval, initial_jitter, initial_shape
 from hub.calibration.rigid_body.result import BodySolution, publish
 from hub.calibration.rigid_body.start import initial_lens, largest_group, orient_views, solve_body_pairs, start_bodies
@@ -125,7 +124,7 @@ def _solve(given: _Input, report: Progress, shared_clock: bool) -> BodySolution:
             raise Refused(
                 f"no two cameras could be connected by the board's motion ({_listed(refused)})",
                 refused,
-                pairs=_failed(pairs),
+                pairs=tuple(PairReport(pair, found.reason or "ok") for pair, found in pairs.items()),
             )
         names = list(group)
         if given.known is not None:
@@ -240,10 +239,6 @@ def _in_step(given: _Input, free: BodySolution, report: Progress) -> BodySolutio
     warnings = (warning, *((f"by the board's motion, exposures differ from the stamps: {late}",) if late else ()))
     estimated = {name: std for name, std in free.lens_stds().items() if name in solution.names}
     return replace(solution, warnings=warnings, estimated=estimated)
-
-
-def _failed(pairs: Mapping[tuple[str, str], BodyPair]) -> tuple[PairReport, ...]:
-    return tuple(PairReport(pair, found.reason or "ok") for pair, found in pairs.items())
 
 
 def _listed(reasons: Mapping[str, str]) -> str:
