@@ -18,7 +18,6 @@ from deploy.demo.flight_outcome import (
     LOG,
     REPORT,
     FlightOutcome,
-    as_json,
     compare_geo_positions,
     compare_log_with_world,
 )
@@ -106,7 +105,7 @@ def run_town(
         geo_near=near,
         geo_median_m=median,
     )
-    write_atomically(out / RESULT, as_json(outcome) + "\n")
+    write_atomically(out / RESULT, outcome.as_json() + "\n")
     write_report(out / REPORT, out / LOG, outcome, world)
     return outcome
 

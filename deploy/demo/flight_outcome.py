@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +61,25 @@ class FlightOutcome:
         return (
             enough and honest and located and (self.out_length is None or self.out_frames < 5 or self.out_length >= 0.5)
         )
+
+    def as_json(self) -> str:
+        """The outcome as one JSON object."""
+        return json.dumps({**asdict(self), "good": self.good}, allow_nan=False)
+
+    def print(self, out: Path) -> None:
+        """Print the table of results and the output files."""
+        from rich.table import Table
+
+        from deploy.offline.outputs import wide_console
+
+        table = Table("", "estimated", "limit", title="estimated against true position of the car")
+        for row in as_rows(self):
+            table.add_row(*row)
+        console = wide_console()
+        console.print(table)
+        console.print(f"{self.statuses} tracking statuses received over MAVLink", soft_wrap=True)
+        console.print(f"the log is {out / LOG}, the report {out / REPORT}", soft_wrap=True)
+        console.print(f"replay it: syncline replay {out / LOG} --through uav --out again.mcap", soft_wrap=True)
 
 
 def compare_log_with_world(log: Path, world: FlightWorld, boot_s: float, statuses: int = 0) -> FlightOutcome:
@@ -125,14 +145,6 @@ def compare_geo_positions(
     return _share(table <= np.maximum(3.0 * np.array(accuracies), _MIN_GEO_TOLERANCE_M)), _median(table)
 
 
-def as_json(outcome: FlightOutcome) -> str:
-    """The outcome as one JSON object."""
-    import json
-    from dataclasses import asdict
-
-    return json.dumps({**asdict(outcome), "good": outcome.good}, allow_nan=False)
-
-
 def as_rows(outcome: FlightOutcome) -> list[tuple[str, str, str]]:
     """Rows of the table: quantity, estimate, limit."""
 
@@ -157,22 +169,6 @@ def as_rows(outcome: FlightOutcome) -> list[tuple[str, str, str]]:
         rows.append(("frame to status, p99", f"{1e3 * outcome.latency_p99_s:.0f} ms", ""))
     states = ", ".join(f"{outcome.states.get(name, 0)} {name}" for name in ("visible", "coasting", "lost"))
     return [*rows, ("states", states, "")]
-
-
-def print_outcome(outcome: FlightOutcome, out: Path) -> None:
-    """Print the table of results and the output files."""
-    from rich.table import Table
-
-    from deploy.offline.outputs import wide_console
-
-    table = Table("", "estimated", "limit", title="estimated against true position of the car")
-    for row in as_rows(outcome):
-        table.add_row(*row)
-    console = wide_console()
-    console.print(table)
-    console.print(f"{outcome.statuses} tracking statuses received over MAVLink", soft_wrap=True)
-    console.print(f"the log is {out / LOG}, the report {out / REPORT}", soft_wrap=True)
-    console.print(f"replay it: syncline replay {out / LOG} --through uav --out again.mcap", soft_wrap=True)
 
 
 def _share(good: Any) -> float | None:
