@@ -11,7 +11,7 @@ from hub.bundle.initialisation import Reconstruction, inlier_share, sigma_limit
 from hub.bundle.model_comparison import LENS, ScoreTest, refuted_lenses
 from hub.bundle.noise.correlated_noise import MIN_INFLATION, lens_tolerance
 from hub.bundle.noise.noise_scale import correlation_inflation
-from hub.bundle.problem import FOCAL, AdjustmentState, Problem
+from hub.bundle.problem import AdjustmentState, Column, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens
 from hub.calibration.self_calibration import MAX_FOCAL_STD
@@ -184,7 +184,7 @@ def _fit(reconstruction: Reconstruction) -> CameraTests:
 
 def _focal_lengths(reconstruction: Reconstruction, found: cov.Covariance) -> CameraTests:
     """Precision of the focal lengths; 0 of one that was kept as given."""
-    stds = np.sqrt(np.maximum(found.variances[:, FOCAL], 0.0))
+    stds = np.sqrt(np.maximum(found.variances[:, Column.FOCAL], 0.0))
     name, source = "std of the focal length", "measured: python -m tests.bench.lenses"
     return {
         camera: [

@@ -9,7 +9,7 @@ import numpy as np
 from hub.bundle.covariance import Covariance
 from hub.bundle.model_comparison import LENS, ScoreTest, mirrored_axis, refuted_lenses
 from hub.bundle.normal_equations import build_system
-from hub.bundle.problem import CAMERA_PARAMETERS, FOCAL, OFFSET, AdjustmentState, Problem
+from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, Column, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
@@ -69,7 +69,7 @@ def sensitivities(
     if held:
         freed = replace(problem, free_parameters=replace(free, lens=True))
         system, columns = build_system(freed, state, prior, robust=False)[0], freed.free_columns
-        focal = np.searchsorted(columns, np.array(held) * CAMERA_PARAMETERS + FOCAL)
+        focal = np.searchsorted(columns, np.array(held) * CAMERA_PARAMETERS + Column.FOCAL)
         normal = system.corner.columns(focal)[np.searchsorted(columns, base)]
         # The paths were eliminated for the covariance: all but the focal lengths' columns of the border is in A⁻¹ B.
         for (_, seeing, border), (_, own, solved) in zip(system.border.parts, found.a_inv_b.parts, strict=True):
@@ -92,7 +92,7 @@ def sensitivities(
         if i in lenses:
             mine.append(_effect("lens", std_of_lens, std_of_lens * lenses[i], names, problem))
         elif camera.is_measured and lens is not None:
-            pull = (base == i * CAMERA_PARAMETERS + FOCAL) / lens.focal_std
+            pull = (base == i * CAMERA_PARAMETERS + Column.FOCAL) / lens.focal_std
             mine.append(_effect("lens", lens.focal_std, found.spread(found.free @ pull), names, problem))
         out.append(tuple(mine))
     return out
@@ -102,6 +102,6 @@ def _effect(given: str, std: float, change: Floats, names: list[str], problem: P
     """The effect of a change (18 n,) of all cameras' parameters."""
     by_camera = change.reshape(len(names), CAMERA_PARAMETERS)
     moved = np.linalg.norm(by_camera[:, 3:6], axis=1)
-    lags = by_camera[:, OFFSET] - by_camera[problem.clock_reference, OFFSET]
+    lags = by_camera[:, Column.OFFSET] - by_camera[problem.clock_reference, Column.OFFSET]
     farthest = int(np.argmax(moved))
     return Sensitivity(given, std, float(moved[farthest]), names[farthest], float(np.abs(lags).max()))

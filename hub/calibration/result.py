@@ -23,7 +23,7 @@ from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation
 from hub.bundle.noise.noise_scale import rescale_noise
 from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
 from hub.bundle.preprocessing import PreparedSession
-from hub.bundle.problem import FOCAL, LARGE_NETWORK, READOUT, AdjustmentState, Problem
+from hub.bundle.problem import LARGE_NETWORK, AdjustmentState, Column, Problem
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.calibration.given_values import refuted_lens_warnings, sensitivities
@@ -114,7 +114,7 @@ def assemble_calibration(
     scaled = rescale_noise(noisy, scaled, prior)
     covariance = cov.covariance(noisy, scaled, prior, gauge.information, datum_points, gauge.exact)
     effects = sensitivities(rig, names, noisy, scaled, prior, covariance)
-    lens_stds, readout_stds = np.sqrt(np.maximum(covariance.variances[:, [FOCAL, READOUT]], 0.0)).T
+    lens_stds, readout_stds = np.sqrt(np.maximum(covariance.variances[:, [Column.FOCAL, Column.READOUT]], 0.0)).T
     time_origins = [solution.prepared.time_origins[name] for name in names]
     time_scales = [solution.prepared.time_scale(name) for name in names]
     base = state.cameras[reference]

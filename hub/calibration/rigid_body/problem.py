@@ -6,15 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.bundle.problem import ASPECT, CENTRE, FOCAL, K1, K2, K3, OFFSET, P1, RATE, READOUT, CameraState
+from hub.bundle.problem import CameraState, Column
 from hub.calibration.rigid_body.motion import BodyMotion
 from hub.calibration.rigid_body.views import CameraViews
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Bools, Floats
 from protocols.session.calibration import AdjustmentStep
 
-LENS = (FOCAL, K1, CENTRE, CENTRE + 1, K2, K3, ASPECT, P1, P1 + 1)
-"""Columns of a lens that is estimated; a fisheye lens has no P1, P1 + 1."""
 _SHAPE_START = 2e-3  # of the distance of neighbouring points: of a print on paper
 _JITTER_START = 0.1  # of a frame interval
 
@@ -45,11 +43,11 @@ class BodyProblem:
         if not self.fixed[camera] and (camera != self.reference or any(self.fixed)):
             out += range(6)
         if self.clock and camera != self.reference:
-            out += [OFFSET, RATE]
+            out += [Column.OFFSET, Column.RATE]
         if self.clock and self.free_readout[camera]:
-            out.append(READOUT)
+            out.append(Column.READOUT)
         if self.free_lens[camera]:
-            out += LENS[: 7 if self.nominal[camera].fisheye else None]
+            out += Column.LENS[: 7 if self.nominal[camera].fisheye else None]
         return out
 
 

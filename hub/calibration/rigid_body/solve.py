@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.bundle.preprocessing import nominal_intrinsics
-from hub.bundle.problem import FOCAL, OFFSET
+from hub.bundle.problem import Column
 from hub.calibration.rigid_body.adjustment import adjust_bodies
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval, initial_jitter, initial_shape
 from hub.calibration.rigid_body.result import BodySolution, publish
@@ -176,7 +176,7 @@ def _unacceptable(solution: BodySolution) -> tuple[str, str]:
         return names[worst], f"only {100 * shares[worst]:.0f} % of its corners fit the board that the others saw"
     covariance = body_covariance(problem, state)
     for camera, name in enumerate(names):
-        std = covariance.std(camera, FOCAL)
+        std = covariance.std(camera, Column.FOCAL)
         if problem.free_lens[camera] and not std <= MAX_BOARD_FOCAL_STD:
             return name, (
                 f"the board determines its focal length only to {100 * std:.0f} % (std): tilt the board towards it, "
@@ -185,7 +185,7 @@ def _unacceptable(solution: BodySolution) -> tuple[str, str]:
         turn = max(covariance.std(camera, column) for column in range(3))
         if not turn <= _MAX_ROTATION_STD:
             return name, f"the board determines its orientation only to {np.degrees(turn):.1f}° (std)"
-        clock = covariance.std(camera, OFFSET)
+        clock = covariance.std(camera, Column.OFFSET)
         limit = _MAX_CLOCK_FRAMES * frame_interval(problem.views[camera])
         if problem.clock and not clock <= limit:
             return name, f"the board's motion determines its clock only to {1e3 * clock:.0f} ms (std): move it faster"
@@ -204,7 +204,7 @@ def _is_in_step(solution: BodySolution) -> bool:
     covariance = body_covariance(problem, state)
     interval = np.sqrt(12.0) * state.jitter
     lags = np.abs(np.array(list(_stamp_lags(solution).values())))
-    stds = np.array([covariance.std(camera, OFFSET) for camera in range(len(lags))])
+    stds = np.array([covariance.std(camera, Column.OFFSET) for camera in range(len(lags))])
     return bool((lags <= np.maximum(interval, interval[problem.reference]) + 3.0 * stds).all())
 
 
@@ -230,7 +230,7 @@ def _in_step(given: _Input, free: BodySolution, report: Progress) -> BodySolutio
     solution = _solve(fixed, report, True)
     lags = _stamp_lags(free)
     covariance = body_covariance(free.problem, free.state)
-    stds = {name: covariance.std(camera, OFFSET) for camera, name in enumerate(free.names)}
+    stds = {name: covariance.std(camera, Column.OFFSET) for camera, name in enumerate(free.names)}
     late = ", ".join(f"{name} {1e3 * lag:+.0f} ms" for name, lag in lags.items() if abs(lag) > 3.0 * stds[name])
     warning = (
         "the clips have the same time stamps, and lags as of a recorder that takes each camera's latest image: "

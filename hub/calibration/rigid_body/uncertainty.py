@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solveh_banded
 
-from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET
+from hub.bundle.problem import CAMERA_PARAMETERS, Column
 from hub.calibration.rigid_body.linear_system import (
     BLOCK,
     ReducedSystem,
@@ -68,7 +68,7 @@ def body_covariance(problem: BodyProblem, state: BodyState) -> BodyCovariance:
     full[np.ix_(columns, columns)] = enlarged[: len(columns), : len(columns)]
     for camera, jitter in enumerate(state.jitter):
         # A clock is that of the mean time stamp, which is known as well as the mean of so many time errors.
-        at = camera * CAMERA_PARAMETERS + OFFSET
+        at = camera * CAMERA_PARAMETERS + Column.OFFSET
         for one in {camera, problem.reference}:
             extra = float(state.jitter[one]) ** 2 / max(len(problem.views[one].time), 1)
             full[at, at] += extra if camera != problem.reference and jitter >= 0.0 else 0.0
