@@ -12,8 +12,8 @@ from hub.view.player import Recording
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.files import check_folder, completed_file
+from protocols.core.jpeg import ThumbnailScale, thumbnail_scale
 from protocols.geometry import so3
-from protocols.log.write.thumbnails import ThumbnailScale, thumbnail_scale
 from protocols.messages import syncline_pb2 as pb
 
 _TIME = "recording"

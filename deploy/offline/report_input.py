@@ -17,11 +17,10 @@ import numpy as np
 from hub.api import CALIBRATION, RESULT, TRAJECTORY, calibrate, read_session
 from hub.report.convergence import OffsetStdSample
 from protocols import topics
-from protocols.core.acceptance import AcceptanceTest
+from protocols.core.acceptance import AcceptanceTest, PairReport
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import read_text
-from protocols.core.pair_report import PairReport
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.log.read.session import is_log

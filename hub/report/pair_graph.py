@@ -6,8 +6,8 @@ import numpy as np
 
 from hub.report.quality_assessment import is_contradicting
 from hub.report.svg import THIN, at, drawing, esc, line, number, rect, text
+from protocols.core.acceptance import PairReport
 from protocols.core.errors import Refused
-from protocols.core.pair_report import PairReport
 from protocols.session.calibration import Calibration
 
 _MAX_LABELS = 15  # more labels than this would overlap

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from protocols.core.acceptance import AcceptanceTest
+from protocols.core.acceptance import AcceptanceTest, PairReport
 from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
 from protocols.core.files import read_toml
-from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics

@@ -17,8 +17,8 @@ from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_int
 from hub.calibration.rigid_body.uncertainty import BodyCovariance, body_covariance, path_covariance
 from hub.trajectory.discrete import INSTANT_TOLERANCE_S, PointBasis
 from hub.two_view.relative_pose import fundamental_from, relative_pose_between
+from protocols.core.acceptance import PairReport
 from protocols.core.clocks import TimeMap
-from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
 from protocols.geometry.pose import Similarity
 from protocols.geometry.types import Floats

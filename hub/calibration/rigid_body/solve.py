@@ -15,8 +15,8 @@ from hub.calibration.rigid_body.result import BodySolution, publish
 from hub.calibration.rigid_body.start import initial_lens, largest_group, orient_views, solve_body_pairs, start_bodies
 from hub.calibration.rigid_body.uncertainty import body_covariance
 from hub.calibration.rigid_body.views import CameraViews, body_labels, gather_views, thinned, view_poses
+from protocols.core.acceptance import PairReport
 from protocols.core.errors import Refused
-from protocols.core.pair_report import PairReport
 from protocols.geometry.camera import Intrinsics
 from protocols.session.calibration import Calibration, FixedCalibration
 from protocols.session.observations import Observations
