@@ -50,9 +50,9 @@ def draw_uav(uav: UavView, picture: Image | None) -> Image:
 
     target, particles, road = uav.at_image()
     if road is not None and len(road.pixels) > 1:
-        _dots(canvas, placed(_pairs(road.pixels)), _ROAD, 2)
+        dots(canvas, placed(_pairs(road.pixels)), _ROAD, 2)
     if particles is not None and target is not None and target.state != "lost" and len(particles.pixels) > 1:
-        _dots(canvas, placed(_pairs(particles.pixels)), _PARTICLES, 3)
+        dots(canvas, placed(_pairs(particles.pixels)), _PARTICLES, 3)
     cv2.rectangle(canvas, (left, top), (left + inner[0] - 1, top + inner[1] - 1), _FRAME, 1)
     if target is not None and len(target.centre) == 2 and target.state != "lost":
         colour = _STATES.get(target.state, _FRAME)
@@ -139,7 +139,7 @@ def _pairs(values: object) -> Floats:
     return np.asarray(numbers[: len(numbers) // 2 * 2].reshape(-1, 2))
 
 
-def _dots(canvas: Image, points: Floats, colour: tuple[int, int, int], size: int) -> None:
+def dots(canvas: Image, points: Floats, colour: tuple[int, int, int], size: int) -> None:
     """Square dots at those points that are on the canvas."""
     height, width = canvas.shape[:2]
     with np.errstate(invalid="ignore"):

@@ -97,7 +97,6 @@ def track(
     from deploy.evaluation.track_scores import read_truth, score
     from deploy.offline import track as tracking
     from deploy.offline.track_log import LoggedFlightImages, open_recording
-    from deploy.offline.track_overlay import draw
     from edge.devices.playback.video_writer import video_writer
     from edge.uav import tracker_factory
 
@@ -143,7 +142,7 @@ def track(
             start=start,
             telemetry=samples,
             georeference=georeference,
-            show=None if write is None else lambda image, tracked: write(draw(image, tracked)),
+            show=None if write is None else lambda image, tracked: write(tracking.draw(image, tracked)),
             progress=frame_done,
         ):
             # Particles and layers are only for the overlay, and would fill the memory for a long video.
