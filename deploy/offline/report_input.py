@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from deploy.offline.progress import Progress
 from hub.api import CALIBRATION, RESULT, TRAJECTORY, calibrate, read_session
 from hub.report.convergence import OffsetStdSample
 from protocols import topics
@@ -55,7 +55,7 @@ class ReportInput:
     history: tuple[OffsetStdSample, ...] = ()
 
 
-def load_report_input(source: Path, session: Path | None, progress: Callable[[str, float], None]) -> ReportInput:
+def load_report_input(source: Path, session: Path | None, progress: Progress) -> ReportInput:
     """The results in an output folder, or those of a session or log, which is calibrated now. Raises InputError."""
     if not source.exists():
         raise InputError("there is no such file or folder", file=source, remedy="name a result folder or a log")

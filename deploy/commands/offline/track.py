@@ -204,7 +204,7 @@ def _samples(
     """The telemetry's samples, warnings, and what corrects positions by them where they are surely on the video's
     clock. Raises InputError."""
     from deploy.offline import track as tracking
-    from deploy.offline.telemetry_files import align_to_video, check_attitudes, read_telemetry_log
+    from deploy.offline.telemetry_files import Footage, align_to_video, check_attitudes, read_telemetry_log
     from deploy.offline.track_log import LoggedFlightImages
     from edge.uav.georeference import Georeference
 
@@ -231,8 +231,8 @@ def _samples(
         gaps = tracking.check_clock(samples, telemetry, *span)
         if flight.lens is not None and flight.mounting is not None:
             with _watched("comparing the telemetry with", flight, quiet) as done:
-                given = flight.video, flight.rate, flight.lens, flight.mounting
-                samples, found, aligned = check_attitudes(recorded, telemetry, *given, done)
+                footage = Footage(flight.video, flight.rate, flight.lens, flight.mounting, done)
+                samples, found, aligned = check_attitudes(recorded, telemetry, footage)
             if aligned:
                 gaps = tracking.check_clock(samples, telemetry, *span)
             warnings += found
@@ -245,8 +245,8 @@ def _samples(
         samples = ()
     else:
         with _watched("looking for the telemetry's clock in", flight, quiet) as done:
-            given = flight.video, flight.rate, flight.lens, flight.mounting
-            samples, found = align_to_video(recorded, telemetry, *given, done)
+            footage = Footage(flight.video, flight.rate, flight.lens, flight.mounting, done)
+            samples, found = align_to_video(recorded, telemetry, footage)
         warnings += found
         aligned = True
     if not aligned or flight.lens is None or flight.mounting is None:
