@@ -148,7 +148,7 @@ def calibrate(
 
 def _have_sizes(prepared: PreparedSession, observations: Observations) -> bool:
     """Whether all rows have sizes."""
-    from hub.baselines.session_poses import all_tracks_have_sizes  # the other solvers do not need to load it
+    from hub.baselines.recursive_poses import all_tracks_have_sizes  # the other solvers do not need to load it
 
     return all_tracks_have_sizes(prepared, observations)
 
