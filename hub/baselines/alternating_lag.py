@@ -16,7 +16,7 @@ from hub.sync.hypothesis import PairSolution
 from hub.sync.pair_solver import evaluate_alignment
 from hub.trajectory.image_tracks import SmoothTrack
 from hub.two_view import relative_pose
-from hub.two_view.fundamental import epipolar_lines, line_distances, maximum_likelihood_fundamental
+from hub.two_view.relative_pose import epipolar_lines, line_distances, maximum_likelihood_fundamental
 from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Bools, Floats, Ints

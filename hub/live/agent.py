@@ -14,12 +14,11 @@ from google.protobuf.message import Message
 
 from hub.calibration.resection.unconnected import listed
 from hub.distributed.network.host import ROLE as NODES
-from hub.live.fair_share import FairShare
+from hub.live.fair_share import FairShare, Shedding
 from hub.live.live_hub import SILENT_S, LiveHub
 from hub.live.messages import rig_message
 from hub.live.shard import ROLE as SHARDS
 from hub.live.shard import Shard
-from hub.live.shedding import Shedding
 from protocols.bus.base import Bus, Publisher, Received, agent_status
 from protocols.bus.commands import CommandSubscription
 from protocols.messages import syncline_pb2 as pb

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from protocols.core.errors import InputError
 from protocols.core.files import file_in
-from protocols.formats import caliscope, colmap, opensfm, toml_rigs, xml_rigs, yaml_rigs
+from protocols.formats import colmap, opensfm, toml_rigs, trajectories, xml_rigs, yaml_rigs
 from protocols.formats.cameras import ExportedFiles, convert_units
 from protocols.session.calibration import read_calibration
 from protocols.session.rig import METRES_PER_UNIT
@@ -52,7 +52,7 @@ def caliscope_volume(source: Path, session: Path, out: Path) -> tuple[dict[Path,
     rig, cameras = read_calibration(source)
     found = triangulate(session, source)
     metric = rig.metadata.get("scale", "metric") != "arbitrary"
-    tables, note = caliscope.point_tables(
+    tables, note = trajectories.point_tables(
         found.observations,
         {name: camera.time_map for name, camera in cameras.items() if name not in found.unused},
         toml_rigs.caliscope_numbers(cameras)[0],

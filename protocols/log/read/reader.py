@@ -19,7 +19,6 @@ from mcap.records import Metadata as MetadataRecord
 
 from protocols.core.errors import InputError
 from protocols.log.layout import CHANNEL_RECORD, channel_record
-from protocols.log.read.index import read_index
 from protocols.log.read.mcap_records import (
     MALFORMED,
     Damage,
@@ -29,6 +28,7 @@ from protocols.log.read.mcap_records import (
     chunk_records,
     message_record,
     open_log,
+    read_index,
     read_records,
 )
 from protocols.log.read.migration import upgrades_for
