@@ -15,7 +15,7 @@ import numpy as np
 
 from deploy.offline.progress import Progress
 from hub.api import CALIBRATION, RESULT, TRAJECTORY, calibrate, read_session
-from hub.report.convergence import OffsetStdSample
+from hub.report.time_figures import OffsetStdSample
 from protocols import topics
 from protocols.core.acceptance import AcceptanceTest, PairReport
 from protocols.core.clocks import NANOSECONDS

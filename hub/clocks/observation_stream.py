@@ -13,8 +13,7 @@ from google.protobuf.message import Message
 
 from hub.clocks.change_detector import ClockChange
 from hub.clocks.external_prior import ArrivalPriors, ExternalClockPrior, ExternalClockPriors
-from hub.clocks.rate_change import RateChanges
-from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments
+from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments, RateChanges
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.detections import tracked_kind
 from protocols.core.clocks import NANOSECONDS

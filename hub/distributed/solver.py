@@ -19,8 +19,8 @@ from hub.bundle.initialisation import Reconstruction, reconstruct_with_known_pos
 from hub.bundle.preprocessing import PreparedSession
 from hub.clocks.clock_graph import ClockGraph
 from hub.distributed.network.association import MAX_GAP_S
+from hub.distributed.network.block_solver import connected_cameras, merge_duplicate_factors, position_stds
 from hub.distributed.network.host import UPDATE_PERIOD_S, NodeHost
-from hub.distributed.network.marginals import connected_cameras, merge_duplicate_factors, position_stds
 from hub.distributed.network.messages import ControlPoint, Notice, SharedObservation, StateMessage
 from hub.distributed.network.node import PoseNode
 from hub.trajectory.image_tracks import ImageTrack, SmoothTrack

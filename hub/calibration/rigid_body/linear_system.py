@@ -11,8 +11,7 @@ from hub.bundle.bordered_system import THIRD_DIFFERENCE, third_difference_gradie
 from hub.bundle.problem import Column
 from hub.bundle.residuals import ResidualEvaluation, SplineSupport, evaluate_points, jacobians
 from hub.calibration.rigid_body.lag import rotations
-from hub.calibration.rigid_body.motion import POSE, rotated
-from hub.calibration.rigid_body.problem import BodyProblem, BodyState
+from hub.calibration.rigid_body.problem import POSE, BodyProblem, BodyState, rotated
 from hub.trajectory.splines import SUPPORT, SplineBasis
 from protocols.geometry.types import Bools, Floats, Ints
 

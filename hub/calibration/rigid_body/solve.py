@@ -9,11 +9,10 @@ import numpy as np
 
 from hub.bundle.preprocessing import nominal_intrinsics
 from hub.bundle.problem import Column
-from hub.calibration.rigid_body.adjustment import adjust_bodies
+from hub.calibration.rigid_body.adjustment import adjust_bodies, body_covariance
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval, initial_jitter, initial_shape
 from hub.calibration.rigid_body.result import BodySolution, publish
 from hub.calibration.rigid_body.start import initial_lens, largest_group, orient_views, solve_body_pairs, start_bodies
-from hub.calibration.rigid_body.uncertainty import body_covariance
 from hub.calibration.rigid_body.views import CameraViews, body_labels, gather_views, thinned, view_poses
 from protocols.core.acceptance import PairReport
 from protocols.core.errors import Refused
