@@ -31,10 +31,10 @@ from protocols.session.calibration import (
     CameraCalibration,
     TrajectoryTable,
     read_calibration,
+    read_trajectory,
 )
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
-from protocols.session.trajectory import read_trajectory
 
 _MAX_GAP_S = 0.25  # a trajectory with a longer gap is split
 _OUTLIER_RMS_FACTOR = 6.0  # times the camera's own rms: rows with a larger residual were rejected as outliers

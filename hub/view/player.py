@@ -17,8 +17,7 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.calibration import Calibration, read_calibration, stated_calibration
-from protocols.session.trajectory import read_trajectory
+from protocols.session.calibration import Calibration, read_calibration, read_trajectory, stated_calibration
 from protocols.topics import FLIGHT_IMAGE, PICTURE
 from protocols.validation.rules import SCHEMA_VERSION
 

@@ -14,10 +14,9 @@ from protocols.core.clocks import TimeMap
 from protocols.core.errors import InputError
 from protocols.core.files import completed_file
 from protocols.geometry.types import Floats, Ints
-from protocols.session.calibration import TrajectoryTable
+from protocols.session.calibration import TrajectoryTable, read_labelled_rows
 from protocols.session.observations import Observations
 from protocols.session.rig import METRES_PER_UNIT
-from protocols.session.trajectory import read_labelled_rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)

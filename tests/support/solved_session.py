@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from protocols.core.acceptance import PairReport
 from protocols.core.clocks import TimeMap
 from protocols.geometry.camera import Intrinsics

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.bundle import covariance as cov
 from hub.bundle.adjustment import adjust
 from hub.bundle.block_matrix import BlockSum, DenseCovariance
