@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from deploy.site.doctor import autopilot, machine
 from deploy.site.doctor import agent as agents
+from deploy.site.doctor import autopilot, machine
 from deploy.site.doctor.check_result import CheckResult, skip, unavailable
 from deploy.site.install import units
 from deploy.site.rig_folder import role_of
