@@ -26,7 +26,7 @@ from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import LARGE_NETWORK, AdjustmentState, Column, Problem
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
-from hub.calibration.given_values import refuted_lens_warnings, sensitivities
+from hub.calibration.given_values import measure_scale_bars, refuted_lens_warnings, scaled_by_bars, sensitivities
 from hub.calibration.notes import (
     clock_step_warnings,
     estimated_lenses,
@@ -41,7 +41,6 @@ from hub.calibration.notes import (
     wrong_detector_stds,
 )
 from hub.calibration.pairs.pair_reports import pair_report
-from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
 from hub.calibration.solvers import Solution
 from hub.trajectory.discrete import INSTANT_TOLERANCE_S, PointBasis
 from protocols.core.clocks import TimeMap

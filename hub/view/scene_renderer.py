@@ -168,13 +168,7 @@ class SceneRenderer:
         if self._framed is None or np.linalg.norm(self._framed[0] - middle) > self._framed[1] / 3:
             # Move the viewpoint only if the scene has moved substantially.
             self._framed = (middle, extent)
-            self._server.initial_camera.position = tuple(eye)
-            self._server.initial_camera.look_at = tuple(middle)
-            self._server.initial_camera.up = tuple(up)
-            for client in self._server.get_clients().values():
-                client.camera.up_direction = tuple(up)
-                client.camera.position = tuple(eye)
-                client.camera.look_at = tuple(middle)
+            set_viewpoint(self._server, eye, middle, up)
 
     def _draw_camera(self, camera: CameraView, pose: Pose, now: float) -> None:
         status = camera.state(now)
@@ -385,6 +379,15 @@ def fit_viewpoint(points: Floats, up: Floats, radius: float) -> tuple[Floats, Fl
     lateral = np.maximum(np.abs(centred @ widest), np.abs(centred @ np.cross(towards, widest)))
     distance = float(np.max((lateral + radius) / _TAN_HALF_FOV + depth + radius))
     return middle + distance * towards, middle
+
+
+def set_viewpoint(server: viser.ViserServer, eye: Floats, middle: Floats, up: Floats) -> None:
+    """Move the viewpoint of all browsers, and of those that come."""
+    server.initial_camera.position, server.initial_camera.look_at, server.initial_camera.up = eye, middle, up
+    for client in server.get_clients().values():
+        client.camera.up_direction = up
+        client.camera.position = eye
+        client.camera.look_at = middle
 
 
 def _nearest_point(starts: Floats, ends: Floats, tolerance: float) -> Floats | None:
