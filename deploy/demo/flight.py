@@ -51,7 +51,7 @@ def run_town(
 
     view_port: port of a live view; None = no view, 0 = any free port.
     """
-    from deploy.demo.flight_report import write_report
+    from deploy.demo.flight_outcome import write_report
     from edge.mavlink.roles.station import GroundStation
     from edge.uav.world.patrol import patrol_world
 

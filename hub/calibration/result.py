@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hub.bundle import covariance as cov
-from hub.bundle.datum.control_outliers import reject_outliers, reject_refuted
-from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
+from hub.bundle.datum.control_outliers import adjust_to_control_points, reject_outliers, reject_refuted
 from hub.bundle.datum.gauge import (
     at_control_points,
     fix_gauge,

@@ -15,7 +15,7 @@ from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
 from hub.view.lag_history import LagHistory
-from hub.view.uav_state import UavView
+from hub.view.uav_overlay import UavView
 from protocols import topics
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.pose import Pose
