@@ -76,7 +76,7 @@ def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Dete
 
         marker = config.marker
         if marker.mode != "colour":
-            from edge.detectors.marker.ball import bright_or_tag_detector
+            from edge.detectors.marker.factory import bright_or_tag_detector
 
             return bright_or_tag_detector(
                 marker.mode, marker.threshold, marker.dictionary, marker.label, marker.min_size, marker.max_size

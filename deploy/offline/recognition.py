@@ -17,7 +17,8 @@ from edge.detectors.base import Detector
 from edge.detectors.board.description import BOARD_FILE, Board, BoardKind, load_dictionary, read_board
 from edge.detectors.board.detector import SEARCH_PX, BoardDetector
 from edge.detectors.board.finder import Finder, chessboard_of_any_size, linked_saddles
-from edge.detectors.marker.ball import MarkerModel, ball_detector, bright_or_tag_detector
+from edge.detectors.marker.ball import MarkerModel
+from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.devices.playback.video_reader import VideoFrame, VideoReader
 from edge.offline.sampling import sample_images
 from protocols.core.errors import InputError, Refused

@@ -25,7 +25,8 @@ from edge.detectors import base as detector_base
 from edge.detectors.base import Detector
 from edge.detectors.board.description import BOARD_FILE, Board
 from edge.detectors.board.detector import BoardDetector
-from edge.detectors.marker.ball import MarkerModel, ball_detector, bright_or_tag_detector
+from edge.detectors.marker.ball import MarkerModel
+from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.detectors.plugins import detector_revision, is_plugin, load_detector, unknown_detector
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav, is_video
 from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector

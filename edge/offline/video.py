@@ -10,7 +10,8 @@ from typing import Literal, get_args
 import tomli_w
 
 from edge.detectors.base import Detector, Kind
-from edge.detectors.marker.ball import MarkerModel, ball_detector, bright_or_tag_detector, learn_marker_model
+from edge.detectors.marker.ball import MarkerModel, learn_marker_model
+from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.detectors.moving.foreground import SubtractorName
 from edge.detectors.plugins import is_plugin, load_detector, unknown_detector
 from edge.devices.base import check_size

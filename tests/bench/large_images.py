@@ -16,7 +16,8 @@ import numpy as np
 from edge.detectors.base import Detection
 from edge.detectors.board.description import parse_board
 from edge.detectors.board.detector import BoardDetector
-from edge.detectors.marker.ball import MarkerModel, ball_detector
+from edge.detectors.marker.ball import MarkerModel
+from edge.detectors.marker.factory import ball_detector
 from protocols.geometry.types import Image
 from tests.support import boards
 

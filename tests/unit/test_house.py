@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tests.unit.test_structure import PACKAGES, ROOT, _tracked
 
-MOST_SOURCE_LINES = 96_501  # sharded hubs, clocks set or slewed, kernels, conventions named, people exchanged
+MOST_SOURCE_LINES = 95_901  # modules beside what they belong to, one lens, status and namespace of columns for all
 MOST_UNEXPLAINED_CONSTANTS = 0
 MOST_COMPLEXITY = 15
 

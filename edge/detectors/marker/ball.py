@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.detectors.base import Detection, Detector, Prediction
+from edge.detectors.base import Detection, Prediction
 from edge.detectors.marker.colour import ColourModel, colour_indices, learn_colour_model
 from edge.detectors.marker.subpixel_outline import Outline, StaticBackground, measure_outline
 from protocols.core.errors import InputError
@@ -287,29 +287,3 @@ def _solidity(moments: dict[str, float]) -> float:
     spread = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
     ellipse = 4.0 * np.pi * np.sqrt(np.linalg.det(spread + np.eye(2) / 12.0))
     return float(min(area / ellipse, 1.0))
-
-
-def ball_detector(model: MarkerModel, lens: Intrinsics | None, size: tuple[int, int]) -> MarkerDetector:
-    """The ball detector of one camera; a lens given for an image size other than the video's is ignored."""
-    fits = lens is not None and (lens.width, lens.height) == size
-    return MarkerDetector(model, lens if fits else None)
-
-
-def bright_or_tag_detector(
-    mode: Literal["bright", "tag"],
-    threshold: int = 200,
-    dictionary: str = "apriltag_36h11",
-    label: str = "marker",
-    min_size: float | None = None,
-    max_size: float | None = None,
-) -> Detector:
-    """The detector of a point of light or of fiducial tags; see ``MarkerConfig``. Raises InputError."""
-    if mode == "tag":
-        from edge.detectors.marker.tag import TagDetector, TagModel
-
-        tags = TagModel(dictionary, "tag" if label == "marker" else label)
-        return TagDetector(tags if min_size is None else replace(tags, min_size=min_size))
-    from edge.detectors.marker.bright import BrightDetector, BrightModel
-
-    light = BrightModel(threshold, min_size or 0.0, label=label)
-    return BrightDetector(light if max_size is None else replace(light, max_size=max_size))
