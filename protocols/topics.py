@@ -6,6 +6,7 @@ added in one place.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -94,3 +95,15 @@ def liveliness_key(site: str, role: str, agent: str, boot_id: str) -> str:
         f"syncline/{check_identifier(site, 'site')}/alive/{check_identifier(role, 'role')}/{key_segment(agent)}/"
         f"{check_identifier(boot_id, 'boot id')}"
     )
+
+
+OUTAGE_S = 60.0
+"""The longest link outage without message loss, unless configured otherwise."""
+_MARGIN = 1.5  # rates vary, and an outage is noticed late
+
+
+def cache_size(topic: Topic, rate_hz: float | None = None, outage_s: float = OUTAGE_S) -> int:
+    """Messages that a publisher of ``topic`` caches: the last one, or those of an outage plus a margin."""
+    if topic.delivery is Delivery.LATEST:
+        return 1
+    return max(1, math.ceil(max(topic.rate_hz, rate_hz or 0.0) * outage_s * _MARGIN))

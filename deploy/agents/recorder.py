@@ -15,7 +15,7 @@ from pathlib import Path
 from deploy.agents.retention import Retention, Space, free_bytes, unused_log_path
 from deploy.config.agents import RecorderConfig
 from deploy.config.file import effective_toml
-from protocols.bus.base import Bus, Received, Subscription
+from protocols.bus.base import Bus, Received, Subscription, agent_status
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.version import VERSION
@@ -85,9 +85,7 @@ def run_recorder(
         subscriptions = [bus.subscribe(topic) for topic in wanted]
         limiter = ThumbnailRateLimiter(config.pictures_hz)
         publisher = bus.publisher(STATUS, config.id)
-        status = pb.AgentStatus(
-            schema_version=SCHEMA_VERSION, agent=config.id, role=ROLE, boot_id=boot, state="running", version=VERSION
-        )
+        status = agent_status(ROLE, config.id, boot, 0, "running", "")
         messages = 0
         missing = MissingMessages()
         next_sync = next_status = time.monotonic()

@@ -14,13 +14,10 @@ import msgspec
 from deploy.agents.recorder import ROLE, RecorderResult, run_recorder
 from deploy.agents.retention import RESUME_MARGIN, Retention, Space, free_bytes
 from deploy.config.agents import RecorderConfig
-from protocols.bus.base import Bus
+from protocols.bus.base import Bus, agent_status
 from protocols.bus.commands import CommandSubscription
 from protocols.core.errors import EXIT_DONE, InputError
-from protocols.core.version import VERSION
-from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS
-from protocols.validation.rules import SCHEMA_VERSION
 
 _STATUS_S = 1.0  # as all agents: health counts 5 s without a status as dead
 _START, _STOP = "start_recording", "stop_recording"
@@ -140,21 +137,10 @@ class _Waiting:
                             return
                         next_status = now + _STATUS_S
                         self._sequence += 1
-                        publisher.put(self._status(state, text))
+                        gauges = {"recording": 0.0}
+                        status = agent_status(ROLE, self._agent, self._boot, self._sequence, state, text, {}, gauges)
+                        publisher.put(status)
                     self._beat()
                     self._stop.wait(_STATUS_S / 10)
         finally:
             publisher.close()
-
-    def _status(self, state: str, text: str) -> pb.AgentStatus:
-        return pb.AgentStatus(
-            schema_version=SCHEMA_VERSION,
-            agent=self._agent,
-            role=ROLE,
-            boot_id=self._boot,
-            sequence=self._sequence,
-            state=state,
-            message=text,
-            version=VERSION,
-            gauges={"recording": 0.0},
-        )

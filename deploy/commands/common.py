@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -31,6 +32,11 @@ Scheduler = Annotated[
 NumberList = Annotated[str, Parameter(allow_leading_hyphen=True)]  # "-3,9" is a value
 Role = Literal["camera", "uav", "hub", "recorder", "router"]
 Names = Annotated[list[str] | None, Parameter(negative="", help="Only these agents, by id or ROLE-ID.")]
+
+
+def command_line() -> str:
+    """This command as it was typed, for results to state."""
+    return shlex.join(["syncline", *sys.argv[1:]])
 
 
 def check_range(option: str, value: float | None, low: float, high: float, remedy: str = "") -> None:

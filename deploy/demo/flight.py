@@ -18,7 +18,6 @@ from deploy.demo.flight_outcome import (
     LOG,
     REPORT,
     FlightOutcome,
-    as_json,
     compare_geo_positions,
     compare_log_with_world,
 )
@@ -52,7 +51,7 @@ def run_town(
 
     view_port: port of a live view; None = no view, 0 = any free port.
     """
-    from deploy.demo.flight_report import write_report
+    from deploy.demo.flight_outcome import write_report
     from edge.mavlink.roles.station import GroundStation
     from edge.uav.world.patrol import patrol_world
 
@@ -106,7 +105,7 @@ def run_town(
         geo_near=near,
         geo_median_m=median,
     )
-    write_atomically(out / RESULT, as_json(outcome) + "\n")
+    write_atomically(out / RESULT, outcome.as_json() + "\n")
     write_report(out / REPORT, out / LOG, outcome, world)
     return outcome
 

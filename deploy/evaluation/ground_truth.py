@@ -36,10 +36,11 @@ class CameraError:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationComparison:
-    """Errors of all cameras; missing: cameras without a calibration."""
+    """Errors of all cameras; missing: cameras without a calibration. first_calibration_s: when the first was there."""
 
     cameras: tuple[CameraError, ...]
     missing: tuple[str, ...]
+    first_calibration_s: float | None
 
     @property
     def good(self) -> bool:
@@ -51,34 +52,26 @@ class CalibrationComparison:
             for c in self.cameras
         )
 
-    def as_json(self, first_calibration_s: float | None) -> str:
+    def as_json(self) -> str:
         """The comparison as one JSON object."""
         document = {
             "good": self.good,
             "missing": list(self.missing),
-            "first_calibration_s": first_calibration_s,
+            "first_calibration_s": self.first_calibration_s,
             "cameras": [asdict(camera) for camera in self.cameras],
         }
         return json.dumps(document)
 
-    def print(self, first_calibration_s: float | None, out: Path) -> None:
+    def print(self, out: Path) -> None:
         """Print the comparison as a table."""
         from rich.table import Table
 
         from deploy.offline.outputs import wide_console
 
         console = wide_console()
-        table = Table(title="recovered against true", title_justify="left")
-        for column in (
-            "camera",
-            "true lag [s]",
-            "recovered [s]",
-            "error [ms]",
-            "std [ms]",
-            "rotation [°]",
-            "direction [°]",
-        ):
-            table.add_column(column, justify="left" if column == "camera" else "right")
+        table = Table("camera", title="recovered against true", title_justify="left")
+        for column in ("true lag [s]", "recovered [s]", "error [ms]", "std [ms]", "rotation [°]", "direction [°]"):
+            table.add_column(column, justify="right")
         for c in self.cameras:
             table.add_row(
                 c.camera,
@@ -94,13 +87,15 @@ class CalibrationComparison:
             console.print(f"{name}: not calibrated")
         limits = f"{MAX_OFFSET_ERROR_MS:g} ms, {MAX_ROTATION_ERROR_DEG:g}° and {MAX_DIRECTION_ERROR_DEG:g}°"
         console.print(f"every camera within {limits}" if self.good else f"NOT every camera is within {limits}")
-        if first_calibration_s is not None:
-            console.print(f"first calibration after {first_calibration_s:.1f} s")
+        if self.first_calibration_s is not None:
+            console.print(f"first calibration after {self.first_calibration_s:.1f} s")
         console.print(f"log {out / 'demo.mcap'}, report {out / 'report.html'}", soft_wrap=True)
         console.print(f"again from the log: syncline calibrate {out / 'demo.mcap'} --out again", soft_wrap=True)
 
 
-def compare_with_truth(folder: Path, scene_name: str, seed: int, cameras: int) -> CalibrationComparison:
+def compare_with_truth(
+    folder: Path, scene_name: str, seed: int, cameras: int, first_calibration_s: float | None
+) -> CalibrationComparison:
     """Compare the outputs in a folder with the simulated scene.
 
     Poses are compared in the reference camera's frame, without a similarity alignment that could hide errors.
@@ -134,7 +129,8 @@ def compare_with_truth(folder: Path, scene_name: str, seed: int, cameras: int) -
                 else _direction(found.pose, base, truth, base_truth),
             )
         )
-    return CalibrationComparison(tuple(out), tuple(c.name for c in scene.cameras if c.name not in solved))
+    missing = tuple(camera.name for camera in scene.cameras if camera.name not in solved)
+    return CalibrationComparison(tuple(out), missing, first_calibration_s)
 
 
 def _direction(found: Pose, base: Pose, truth: Pose, base_truth: Pose) -> float:

@@ -12,8 +12,8 @@ from hub.view.player import Recording
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.files import check_folder, completed_file
+from protocols.core.jpeg import ThumbnailScale, thumbnail_scale
 from protocols.geometry import so3
-from protocols.log.write.thumbnails import ThumbnailScale, thumbnail_scale
 from protocols.messages import syncline_pb2 as pb
 
 _TIME = "recording"
@@ -70,7 +70,8 @@ def _log(rr: Any, stream: Any, message: Any, scales: dict[str, ThumbnailScale]) 
         pixels = [scale.place(one.u, one.v) for one in message.detections]
         stream.log(f"world/cameras/{_name(rr, message.camera)}/detections", rr.Points2D(pixels, radii=4.0))
     elif isinstance(message, pb.Track):
-        label = _entity_name(message.label)
+        # A part of an entity's path has no special characters.
+        label = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in message.label) or "point"
         stream.set_time("reference", duration=message.reference_time_ns / NANOSECONDS)
         stream.log(f"world/paths/{label}", rr.Points3D([list(message.position)], radii=0.02))
     elif isinstance(message, pb.CameraInfo):
@@ -125,8 +126,3 @@ def _camera(rr: Any, stream: Any, camera: pb.CameraCalibration) -> None:
 def _name(rr: Any, name: str) -> str:
     """An agent's name, escaped as one part of an entity path."""
     return str(rr.escape_entity_path_part(name))
-
-
-def _entity_name(label: str) -> str:
-    """A label, with special characters replaced, as one part of an entity path."""
-    return "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in label) or "point"

@@ -6,9 +6,12 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+Progress = Callable[[str, float], None]
+"""Called with what is done now and the share, 0..1, of the whole."""
+
 
 @contextmanager
-def progress_bar(title: str, quiet: bool = False) -> Iterator[Callable[[str, float], None]]:
+def progress_bar(title: str, quiet: bool = False) -> Iterator[Progress]:
     """A bar moved by the yielded ``move(text, share)``, share 0..1; not drawn if standard error is not a terminal."""
     if quiet or not sys.stderr.isatty():
         yield lambda text, share: None

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from deploy.offline.progress import Progress
 from edge.detectors.base import Detector
 from edge.detectors.board.description import BOARD_FILE, Board, BoardKind, load_dictionary, read_board
 from edge.detectors.board.detector import SEARCH_PX, BoardDetector
-from edge.detectors.board.finder import Finder, chessboard_of_any_size
-from edge.detectors.board.saddles import linked_saddles
+from edge.detectors.board.finder import Finder, chessboard_of_any_size, linked_saddles
 from edge.detectors.marker.ball import MarkerModel
 from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.devices.playback.video_reader import VideoFrame, VideoReader
@@ -43,7 +43,6 @@ _LEAST_SEEN = 10  # frames of these in which it is seen: a shorter track is of n
 _EXAMPLE = 'board = "charuco", squares = "8x5", square_size = 0.03 [m]'
 
 Grey = npt.NDArray[np.uint8]
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True)

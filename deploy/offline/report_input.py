@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,14 +13,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from deploy.offline.progress import Progress
 from hub.api import CALIBRATION, RESULT, TRAJECTORY, calibrate, read_session
-from hub.report.convergence import OffsetStdSample
+from hub.report.time_figures import OffsetStdSample
 from protocols import topics
-from protocols.core.acceptance import AcceptanceTest
+from protocols.core.acceptance import AcceptanceTest, PairReport
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import read_text
-from protocols.core.pair_report import PairReport
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.log.read.session import is_log
@@ -32,10 +31,10 @@ from protocols.session.calibration import (
     CameraCalibration,
     TrajectoryTable,
     read_calibration,
+    read_trajectory,
 )
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
-from protocols.session.trajectory import read_trajectory
 
 _MAX_GAP_S = 0.25  # a trajectory with a longer gap is split
 _OUTLIER_RMS_FACTOR = 6.0  # times the camera's own rms: rows with a larger residual were rejected as outliers
@@ -56,7 +55,7 @@ class ReportInput:
     history: tuple[OffsetStdSample, ...] = ()
 
 
-def load_report_input(source: Path, session: Path | None, progress: Callable[[str, float], None]) -> ReportInput:
+def load_report_input(source: Path, session: Path | None, progress: Progress) -> ReportInput:
     """The results in an output folder, or those of a session or log, which is calibrated now. Raises InputError."""
     if not source.exists():
         raise InputError("there is no such file or folder", file=source, remedy="name a result folder or a log")

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +37,16 @@ _MARGIN_S = 3.0  # duration of samples kept before and after the video
 
 _Reading = tuple[Sequence[Telemetry], Floats]
 """Samples and body_from_camera, as they are or by another convention."""
+
+
+class Footage(NamedTuple):
+    """A video with its lens and mounting. progress: called with the index of each frame that is read."""
+
+    video: Path
+    fps: float | None
+    lens: Intrinsics
+    body_from_camera: Floats
+    progress: Callable[[int], None]
 
 
 def _each(convert: Callable[[Floats], Floats]) -> Callable[[Sequence[Telemetry], Floats], _Reading]:
@@ -106,25 +117,17 @@ def read_telemetry_log(file: Path, source: tuple[str, str] | None = None) -> Tel
     return TelemetryFile(longest, left_out, others=tuple(others))
 
 
-def align_to_video(
-    recorded: TelemetryFile,
-    file: Path,
-    video: Path,
-    fps: float | None,
-    lens: Intrinsics,
-    body_from_camera: Floats,
-    progress: Callable[[int], None] | None = None,
-) -> tuple[tuple[Telemetry, ...], list[str]]:
+def align_to_video(recorded: TelemetryFile, file: Path, footage: Footage) -> tuple[tuple[Telemetry, ...], list[str]]:
     """The samples on the video's clock, 0 = its first frame, and warnings for the user.
 
-    No samples if the offset can't be estimated; a warning gives the reason. progress: called with each frame's index.
+    No samples if the offset can't be estimated; a warning gives the reason.
     Raises InputError where the positions are wrong.
     """
     offset: OffsetEstimate | str = ""
     # The images are read once more only for a log whose first series is not of this video.
     for series in ([recorded.samples], recorded.others[:_MAX_OTHERS]):
-        readings: list[_Reading] = [(samples, body_from_camera) for samples in series]
-        rotations, time = _visual_rotations(video, fps, lens, readings, progress) if readings else ([], math.inf)
+        readings: list[_Reading] = [(samples, footage.body_from_camera) for samples in series]
+        rotations, time = _visual_rotations(footage, readings) if readings else ([], math.inf)
         found = [(find_offset(seen, *reading), reading[0]) for seen, reading in zip(rotations, readings, strict=True)]
         fits = [(one.agreement, k) for k, (one, _) in enumerate(found) if isinstance(one, OffsetEstimate)]
         if fits or not offset:
@@ -144,13 +147,7 @@ def align_to_video(
 
 
 def check_attitudes(
-    recorded: TelemetryFile,
-    file: Path,
-    video: Path,
-    fps: float | None,
-    lens: Intrinsics,
-    body_from_camera: Floats,
-    progress: Callable[[int], None] | None = None,
+    recorded: TelemetryFile, file: Path, footage: Footage
 ) -> tuple[tuple[Telemetry, ...], list[str], bool]:
     """Samples on the video's clock where the offset is observable, else as they are; warnings where it is large or
     attitudes turn otherwise than the images; whether it is observable.
@@ -159,8 +156,10 @@ def check_attitudes(
     """
     from edge.uav.timing.telemetry_track import MAX_OFFSET_S
 
+    body_from_camera = footage.body_from_camera
+
     def search(readings: list[_Reading]) -> list[tuple[OffsetSearch | None, GroundMotion | None, RelativeRotations]]:
-        rotations, _ = _visual_rotations(video, fps, lens, readings, progress)
+        rotations, _ = _visual_rotations(footage, readings)
         limits = -MAX_OFFSET_S, MAX_OFFSET_S
         out: list[tuple[OffsetSearch | None, GroundMotion | None, RelativeRotations]] = []
         for seen, reading in zip(rotations, readings, strict=True):
@@ -226,16 +225,16 @@ def _check_motion(motion: GroundMotion | None, file: Path) -> list[str]:
     return [f"{file}: {motion.wrong_height}: {remedy}"] if motion.wrong_height else []
 
 
-def _visual_rotations(
-    video: Path, fps: float | None, lens: Intrinsics, readings: list[_Reading], progress: Callable[[int], None] | None
-) -> tuple[list[RelativeRotations], float]:
+def _visual_rotations(footage: Footage, readings: list[_Reading]) -> tuple[list[RelativeRotations], float]:
     """The camera's rotations in the video by the tilt of each reading; the time of the last frame used, inf if cut."""
     from edge.uav.timing.visual_rotation import VisualRotationEstimator, median_tilt_rotation
 
-    recording, _ = open_recording(video, fps, lens)
+    recording, _ = open_recording(footage.video, footage.fps, footage.lens)
     try:
         size = (recording.info.width, recording.info.height)
-        estimators = [(VisualRotationEstimator(size, lens), median_tilt_rotation(*reading)) for reading in readings]
+        estimators = [
+            (VisualRotationEstimator(size, footage.lens), median_tilt_rotation(*reading)) for reading in readings
+        ]
         first: float | None = None
         time = 0.0
         for index in range(_MAX_ALIGNMENT_FRAMES):
@@ -247,8 +246,7 @@ def _visual_rotations(
             time = moment - first
             for estimator, tilt in estimators:
                 estimator.update(frame.image, time, tilt)
-            if progress is not None:
-                progress(index)
+            footage.progress(index)
         else:
             time = math.inf
     finally:

@@ -9,7 +9,6 @@ import json
 import os
 import threading
 from collections import Counter
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ import cv2
 import numpy as np
 import tomli_w
 
+from deploy.offline.progress import Progress
 from deploy.offline.recognition import DETECTORS, Target, find_target
 from deploy.offline.single_target import rows_of_head_and_foot, rows_of_one_target
 from edge.detectors import base as detector_base
@@ -42,8 +42,6 @@ from protocols.geometry.camera import Intrinsics
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, read_folder
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, read_rig
-
-Progress = Callable[[str, float], None]
 
 SESSION = "session"
 _DETECTIONS, _STATE = "detections", "videos.json"

@@ -203,7 +203,7 @@ def _simulated_flight(config: Any, world: SimulatedWorldConfig, began: float) ->
 def _simulated_rig(rig: RigFolder, cameras: Sequence[str]) -> dict[str, Any]:
     """Tables of rig.toml of the simulated scene: its intrinsics, and true distances for the pairs given in the rig."""
     from edge import scenes
-    from edge.scenes.common.rescaling import rescale_scene
+    from edge.scenes.common.base import rescale_scene
 
     scene = rescale_scene(
         scenes.get_marker_scene(rig.world.scene, rig.world.seed, max(len(cameras), 2)), rig.world.width, rig.world.fps

@@ -21,10 +21,9 @@ from edge.agents.publish_queue import PublishQueue
 from edge.agents.thumbnails import THUMBNAIL_WIDTH, thumbnail_message
 from edge.detectors.base import Detection, Detector, Prediction
 from edge.devices.base import Device, Frame, HasTemperature, Reconnecting
-from protocols.bus.base import Bus, Subscription
+from protocols.bus.base import Bus, Subscription, agent_status
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
-from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import RigCamera
 from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE, PREDICTION, STATUS, Topic
@@ -252,12 +251,10 @@ class CameraAgent:
         if lens is not None and (lens.width, lens.height) != (info.width, info.height) and info.intrinsics is not None:
             lens = info.intrinsics  # the images are smaller than those the rig file was calibrated for
         if lens is not None:
-            message.matrix.extend(lens.matrix.ravel().tolist())
-            message.distortions.extend(lens.distortions.tolist())
-            message.fisheye = lens.fisheye
+            message.MergeFrom(pb.CameraInfo(**lens.message_fields()))
         if known is not None:
             message.focal_std = known.focal_std if lens is known.intrinsics else 0.0
-            add_rig_pose(message, known)
+            message.MergeFrom(pb.CameraInfo(**known.pose_table()))
         return message
 
     def _status(self, state: str, text: str, sequence: int, out_queue: PublishQueue) -> pb.AgentStatus:
@@ -291,33 +288,7 @@ class CameraAgent:
             span = (recent[-1][0] - recent[0][0]) / NANOSECONDS
             gauges["fps"] = (len(recent) - 1) / span if span > 0 else 0.0
             gauges["latency_s"] = sorted(latency for _, latency in recent)[len(recent) // 2]
-        return pb.AgentStatus(
-            schema_version=SCHEMA_VERSION,
-            agent=self._camera,
-            role=ROLE,
-            boot_id=self.boot_id,
-            sequence=sequence,
-            state=state,
-            message=text,
-            counters=counters,
-            gauges=gauges,
-            version=VERSION,
-        )
-
-
-def add_rig_pose(message: pb.CameraInfo, known: RigCamera) -> None:
-    """Copy a camera's pose and its uncertainty from the rig file into the message; lengths in the rig's units."""
-    for field, values in (
-        (message.position, known.position),
-        (message.position_std, known.position_std),
-        (message.rotation_std, known.rotation_std),
-    ):
-        if values is not None:
-            field.extend(values.tolist())
-    if known.rotation is not None:
-        from protocols.geometry import so3
-
-        message.rotation.extend(so3.log(known.rotation).tolist())
+        return agent_status(ROLE, self._camera, self.boot_id, sequence, state, text, counters, gauges)
 
 
 def detection_message(detection: Detection) -> pb.Detection:

@@ -29,10 +29,9 @@ from edge.mavlink.roles.vehicle import MountSample, Vehicle
 from edge.uav.base import Box, Estimate, Telemetry
 from edge.uav.estimator import TargetEstimator, decode_image
 from edge.uav.timing.clock_alignment import CameraHostClock, ClockAligner
-from protocols.bus.base import Bus
+from protocols.bus.base import Bus, agent_status
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.jpeg import encode_jpeg
-from protocols.core.version import VERSION
 from protocols.geometry import so3
 from protocols.geometry.types import Image
 from protocols.messages import syncline_pb2 as pb
@@ -183,9 +182,7 @@ class UavAgent:
             model=settings.model,
         )
         if settings.lens is not None:
-            message.matrix.extend(settings.lens.matrix.ravel().tolist())
-            message.distortions.extend(settings.lens.distortions.tolist())
-            message.fisheye = settings.lens.fisheye
+            message.MergeFrom(pb.UavInfo(**settings.lens.message_fields()))
         if settings.body_from_camera is not None:
             message.body_from_camera.extend(np.asarray(settings.body_from_camera).ravel().tolist())
         return message
@@ -241,18 +238,8 @@ class UavAgent:
         if self.latencies:
             gauges["latency_s"] = float(np.median(self.latencies))
             gauges["latency_p99_s"] = float(np.quantile(self.latencies, 0.99))
-        return pb.AgentStatus(
-            schema_version=SCHEMA_VERSION,
-            agent=self._agent,
-            role=ROLE,
-            boot_id=self.boot_id,
-            sequence=sequence,
-            state=state,
-            message="".join(letter if letter.isprintable() else " " for letter in message)[:200],
-            counters=counters,
-            gauges=gauges,
-            version=VERSION,
-        )
+        text = "".join(letter if letter.isprintable() else " " for letter in message)[:200]
+        return agent_status(ROLE, self._agent, self.boot_id, sequence, state, text, counters, gauges)
 
     def _loop(self, stop: threading.Event, receiver: Receiver, out_queue: PublishQueue) -> None:
         sequence, settings = 0, self._settings

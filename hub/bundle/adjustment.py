@@ -15,20 +15,11 @@ from hub.bundle.bordered_system import solve
 from hub.bundle.noise.noise_scale import estimate_noise, residual_std
 from hub.bundle.normal_equations import assemble, weigh_residuals
 from hub.bundle.problem import (
-    ASPECT,
     CAMERA_PARAMETERS,
-    CENTRE,
-    FOCAL,
-    K1,
-    K2,
-    K3,
     LARGE_NETWORK,
-    OFFSET,
-    P1,
-    RATE,
-    READOUT,
     AdjustmentState,
     CameraState,
+    Column,
     Problem,
     TrackObservations,
 )
@@ -159,26 +150,26 @@ def apply_camera_step(camera: CameraState, step: Floats) -> CameraState:
     """The camera after a step (18,) of its parameters."""
     pose = Pose(so3.exp(step[:3]) @ camera.pose.rotation, camera.pose.position + step[3:6])
     lens = camera.intrinsics
-    if np.any(step[FOCAL:]):
+    if np.any(step[Column.FOCAL :]):
         matrix = lens.matrix.copy()
-        matrix[:2, :2] *= np.exp(step[FOCAL])
-        matrix[:2, 2] += step[CENTRE : CENTRE + 2]
+        matrix[:2, :2] *= np.exp(step[Column.FOCAL])
+        matrix[:2, 2] += step[Column.CENTRE : Column.CENTRE + 2]
         distortions = lens.distortions.copy()
-        distortions[0] += step[K1]
-        distortions[1] += step[K2]
-        distortions[2 if lens.fisheye else 4] += step[K3]
-        matrix[0, 0] *= np.exp(-0.5 * step[ASPECT])
-        matrix[1, 1] *= np.exp(0.5 * step[ASPECT])
+        distortions[0] += step[Column.K1]
+        distortions[1] += step[Column.K2]
+        distortions[2 if lens.fisheye else 4] += step[Column.K3]
+        matrix[0, 0] *= np.exp(-0.5 * step[Column.ASPECT])
+        matrix[1, 1] *= np.exp(0.5 * step[Column.ASPECT])
         if not lens.fisheye:
-            distortions[2:4] += step[P1:]
+            distortions[2:4] += step[Column.P1 :]
         lens = Intrinsics(lens.width, lens.height, matrix, distortions, lens.fisheye)
     return replace(
         camera,
         pose=pose,
         intrinsics=lens,
-        offset=camera.offset + float(step[OFFSET]),
-        rate=camera.rate + float(step[RATE]),
-        readout=camera.readout + float(step[READOUT]),
+        offset=camera.offset + float(step[Column.OFFSET]),
+        rate=camera.rate + float(step[Column.RATE]),
+        readout=camera.readout + float(step[Column.READOUT]),
     )
 
 

@@ -17,7 +17,7 @@ from hub.bundle.noise.correlated_noise import MIN_INFLATION
 from hub.bundle.noise.gauss_markov import estimate_correlated_noise
 from hub.bundle.noise.noise_scale import correlation_inflation, modelled_inflation, residual_std, score_inflation
 from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
-from hub.bundle.problem import OFFSET, AdjustmentState, ClockStep, Problem, TrackObservations, UsedRows
+from hub.bundle.problem import AdjustmentState, ClockStep, Column, Problem, TrackObservations, UsedRows
 from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians, residual_norms
 from protocols.geometry.types import Floats
 
@@ -203,7 +203,7 @@ def _with_rows_of_a_step(problem: Problem, state: AdjustmentState) -> Problem:
     for part in problem.rows:
         camera, every = state.cameras[part.camera], part.using(np.ones_like(part.use))
         seen = evaluate_labels(UsedRows.of([every]), camera, paths)
-        speed = np.linalg.norm(jacobians(seen, camera, [OFFSET])[:, 3], axis=0)
+        speed = np.linalg.norm(jacobians(seen, camera, [Column.OFFSET])[:, 3], axis=0)
         reach = MAX_STEP_S * speed
         rows.append(part.using(part.use | (seen.valid & (np.linalg.norm(seen.residual, axis=0) < reach))))
     return replace(problem, rows=tuple(rows))

@@ -13,7 +13,7 @@ from scipy.special import erf
 from hub.bundle.block_matrix import BlockSum, BlockTridiagonal, DenseCovariance, ParameterCovariance, SparseCovariance
 from hub.bundle.bordered_system import BAND, Elimination, PathByCameras, eliminate, regularisation
 from hub.bundle.normal_equations import build_system
-from hub.bundle.problem import CAMERA_PARAMETERS, LARGE_NETWORK, OFFSET, RATE, AdjustmentState, Problem
+from hub.bundle.problem import CAMERA_PARAMETERS, LARGE_NETWORK, AdjustmentState, Column, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior, deformation_terms
 from hub.trajectory.banded import cho_solve_banded
 from hub.trajectory.splines import SUPPORT, weighted_sums
@@ -62,7 +62,7 @@ class CameraCovariance:
     @cached_property
     def clocks(self) -> Floats:
         """(2 n, 2 n) of offset and rate of every camera."""
-        return self.of_each_camera(OFFSET, RATE)
+        return self.of_each_camera(Column.OFFSET, Column.RATE)
 
     def spread(self, values: Floats) -> Floats:
         """(18 n, …) values (p, …) of the free parameters among all, 0 of fixed ones."""
@@ -212,7 +212,7 @@ def smallest_relative_stds(cov: CameraCovariance, problem: Problem, state: Adjus
         within = middle[np.ix_(group, group)]
         for best, between in (
             (rotations, relative_rotation_stds(cov, of_group, group)),
-            (clocks, _clock_stds(cov.of_each_camera(OFFSET, RATE, cameras=group), of_group, within)),
+            (clocks, _clock_stds(cov.of_each_camera(Column.OFFSET, Column.RATE, cameras=group), of_group, within)),
         ):
             np.fill_diagonal(between, np.inf)
             best[group] = np.minimum(best[group], between.min(axis=1))

@@ -18,7 +18,7 @@ from hub.bundle.covariance import constrained_step
 from hub.bundle.noise.correlated_noise import lens_tolerance
 from hub.bundle.noise.noise_scale import correlation_inflation
 from hub.bundle.normal_equations import assemble, build_system, weigh_residuals
-from hub.bundle.problem import CAMERA_PARAMETERS, OFFSET, READOUT, AdjustmentState, ClockStep, Problem
+from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, ClockStep, Column, Problem
 from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.banded import cho_solve_banded
@@ -128,7 +128,7 @@ class LinearisedModel:
     def readouts(self) -> dict[int, Ints]:
         """The column (1,) of each camera's readout that was not given."""
         columns = self.problem.free_columns
-        free = np.flatnonzero(columns % CAMERA_PARAMETERS == READOUT)
+        free = np.flatnonzero(columns % CAMERA_PARAMETERS == Column.READOUT)
         return {int(columns[k]) // CAMERA_PARAMETERS: np.array([k]) for k in free}
 
     def best_step(self, camera: int, times: Floats) -> tuple[ClockStep, Floats, Floats]:
@@ -141,7 +141,7 @@ class LinearisedModel:
         )
         mine = np.flatnonzero(columns // CAMERA_PARAMETERS == camera)
         own = (columns[mine] % CAMERA_PARAMETERS).tolist()
-        jacobian = jacobians(seen, state.cameras[camera], [OFFSET, *own])
+        jacobian = jacobians(seen, state.cameras[camera], [Column.OFFSET, *own])
         weight = np.where(seen.valid, seen.relative_information / state.sigma[camera] ** 2, 0.0)
         after = seen.time >= times[:, None]
         weighted = jacobian[:, 3] * weight

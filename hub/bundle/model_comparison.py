@@ -23,19 +23,8 @@ from hub.bundle.linearised_model import LinearisedModel, evidence_needed
 from hub.bundle.noise.correlated_noise import lens_tolerance
 from hub.bundle.noise.noise_scale import correlation_inflation, modelled_inflation
 from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
-from hub.bundle.problem import (
-    CAMERA_PARAMETERS,
-    CENTRE,
-    CRYSTAL_RATE_STD,
-    FOCAL,
-    K1,
-    RATE,
-    AdjustmentState,
-    LensPrior,
-    Problem,
-)
+from hub.bundle.problem import CAMERA_PARAMETERS, CRYSTAL_RATE_STD, AdjustmentState, Column, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
-from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Ints
 from protocols.session.rig import MAX_READOUT_S
 
@@ -50,7 +39,7 @@ _TANGENTIAL_SHARE = 0.25
 """Of what free principal points gain: a ninth of it at most in six mirrored rigs, all of it in others."""
 REFUTED_SIGMA = 4.0
 """Stds from which a rate is no crystal's: of a hundred cameras with crystals one in 160 is refuted."""
-LENS = (FOCAL, K1, CENTRE, CENTRE + 1)
+LENS = (Column.FOCAL, Column.K1, Column.CENTRE, Column.CENTRE + 1)
 """What a measured lens is tested for: another focal length or distortion, and another part of the picture."""
 
 
@@ -95,7 +84,9 @@ def mirrored_axis(problem: Problem, state: AdjustmentState) -> str:
     linear = _with_any_lens(problem, state)
     columns = linear.problem.free_columns
     kept = np.flatnonzero(np.isin(columns, problem.free_columns))
-    own = np.flatnonzero(np.isin(columns, [i * CAMERA_PARAMETERS + CENTRE + axis for i in given for axis in (0, 1)]))
+    own = np.flatnonzero(
+        np.isin(columns, [i * CAMERA_PARAMETERS + Column.CENTRE + axis for i in given for axis in (0, 1)])
+    )
 
     def best_step(free: Ints) -> tuple[Floats, ParameterCovariance]:
         normal, fixed = linear.parts.reduced.restricted(free), linear.fixed[:, free]
@@ -123,7 +114,11 @@ def mirrored_axis(problem: Problem, state: AdjustmentState) -> str:
 
 def _with_any_lens(problem: Problem, state: AdjustmentState) -> LinearisedModel:
     """The model with all lenses free, its noise scaled to the effective sample size."""
-    freed = replace(problem, lens_tolerances=tuple(map(_any_lens, problem.nominal)))
+    # So wide that only the observations count.
+    wide = [
+        replace(lens_tolerance(one), focal_std=0.5, centre_std=0.5 * one.width, k1_std=0.5) for one in problem.nominal
+    ]
+    freed = replace(problem, lens_tolerances=tuple(wide))
     modelled = [modelled_inflation(problem, state, camera) for camera in range(len(state.cameras))]
     inflation = np.maximum(correlation_inflation(problem, state), modelled)
     noisy = replace(state, sigma=state.sigma * np.sqrt(inflation))
@@ -165,11 +160,6 @@ def _refuted_lenses(
             believed = trial
         if len(believed) == len(found):
             return found
-
-
-def _any_lens(lens: Intrinsics) -> LensPrior:
-    """A prior so wide that only the observations count."""
-    return replace(lens_tolerance(lens), focal_std=0.5, centre_std=0.5 * lens.width, k1_std=0.5)
 
 
 def _forward_selection(
@@ -221,7 +211,7 @@ def with_crystal_rates(problem: Problem, state: AdjustmentState) -> Problem:
     reference = state.cameras[problem.clock_reference].rate
     crystal = tuple(
         (camera.rate - reference) ** 2
-        < REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + variance.get(i * CAMERA_PARAMETERS + RATE, 0.0))
+        < REFUTED_SIGMA**2 * (CRYSTAL_RATE_STD**2 + variance.get(i * CAMERA_PARAMETERS + Column.RATE, 0.0))
         for i, camera in enumerate(state.cameras)
     )
     return replace(problem, crystal_rates=crystal)

@@ -10,21 +10,7 @@ import numpy as np
 
 from hub.bundle.block_matrix import BlockSum
 from hub.bundle.bordered_system import BAND, BorderedSystem, PathBlocks, PathByCameras, add_rows
-from hub.bundle.problem import (
-    ASPECT,
-    CAMERA_PARAMETERS,
-    CENTRE,
-    FOCAL,
-    K1,
-    K2,
-    K3,
-    P1,
-    RATE,
-    READOUT,
-    AdjustmentState,
-    LensPrior,
-    Problem,
-)
+from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, Column, LensPrior, Problem
 from hub.bundle.residuals import ResidualEvaluation, StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, smoothness_cost, smoothness_terms
 from protocols.geometry.camera import Intrinsics
@@ -141,26 +127,30 @@ def camera_priors(problem: Problem, state: AdjustmentState) -> list[tuple[int, f
     reference_rate = state.cameras[problem.clock_reference].rate  # the internal time may run at any rate near 1
     for camera, (current, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):
         base = camera * CAMERA_PARAMETERS
-        terms = [(RATE, current.rate - reference_rate, problem.rate_std(camera))]
+        terms = [(Column.RATE, current.rate - reference_rate, problem.rate_std(camera))]
         if free_parameters.readout:
             # About 0, for global shutters, with the second moment of a uniform distribution.
-            terms.append((READOUT, current.readout, problem.longest_readout(camera) / math.sqrt(3.0)))
+            terms.append((Column.READOUT, current.readout, problem.longest_readout(camera) / math.sqrt(3.0)))
         lens_prior = problem.lens_prior(camera)
         if lens_prior is not None:
-            terms.append((FOCAL, float(np.log(current.intrinsics.focal / lens_prior.focal)), lens_prior.focal_std))
+            terms.append(
+                (Column.FOCAL, float(np.log(current.intrinsics.focal / lens_prior.focal)), lens_prior.focal_std)
+            )
         if lens_prior is not None and not lens_prior.focal_only:
             shift = current.intrinsics.matrix[:2, 2] - lens_prior.centre
             terms += [
-                (CENTRE, float(shift[0]), lens_prior.centre_std),
-                (CENTRE + 1, float(shift[1]), lens_prior.centre_std),
+                (Column.CENTRE, float(shift[0]), lens_prior.centre_std),
+                (Column.CENTRE + 1, float(shift[1]), lens_prior.centre_std),
             ]
-            terms.append((K1, float(current.intrinsics.distortions[0] - lens_prior.k1), lens_prior.k1_std))
-            terms.append((K2, float(current.intrinsics.distortions[1] - lens_prior.k2), lens_prior.k2_std))
+            terms.append((Column.K1, float(current.intrinsics.distortions[0] - lens_prior.k1), lens_prior.k1_std))
+            terms.append((Column.K2, float(current.intrinsics.distortions[1] - lens_prior.k2), lens_prior.k2_std))
             terms += _further_lens_priors(current.intrinsics, nominal, lens_prior)
         elif lens_prior is None and free_parameters.lens:
-            terms.append((FOCAL, float(np.log(current.intrinsics.focal / nominal.focal)), free_parameters.focal_std))
             terms.append(
-                (K1, float(current.intrinsics.distortions[0] - nominal.distortions[0]), free_parameters.k1_std)
+                (Column.FOCAL, float(np.log(current.intrinsics.focal / nominal.focal)), free_parameters.focal_std)
+            )
+            terms.append(
+                (Column.K1, float(current.intrinsics.distortions[0] - nominal.distortions[0]), free_parameters.k1_std)
             )
         out += [(base + column, value, std) for column, value, std in terms]
     return out
@@ -173,13 +163,13 @@ def _further_lens_priors(
     third = 2 if current.fisheye else 4
     aspect = np.log(current.matrix[1, 1] / current.matrix[0, 0] / nominal.matrix[1, 1] * nominal.matrix[0, 0])
     terms = [
-        (K3, float(current.distortions[third] - nominal.distortions[third]), lens_prior.k3_std),
-        (ASPECT, float(aspect), lens_prior.aspect_std),
+        (Column.K3, float(current.distortions[third] - nominal.distortions[third]), lens_prior.k3_std),
+        (Column.ASPECT, float(aspect), lens_prior.aspect_std),
     ]
     if not current.fisheye:
         shift = current.distortions[2:4] - nominal.distortions[2:4]
         terms += [
-            (P1, float(shift[0]), lens_prior.tangential_std),
-            (P1 + 1, float(shift[1]), lens_prior.tangential_std),
+            (Column.P1, float(shift[0]), lens_prior.tangential_std),
+            (Column.P1 + 1, float(shift[1]), lens_prior.tangential_std),
         ]
     return terms

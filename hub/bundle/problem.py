@@ -18,15 +18,24 @@ from protocols.session.calibration import AdjustmentStep
 from protocols.session.rig import MAX_READOUT_S
 
 CAMERA_PARAMETERS = 18
-"""Columns of one camera: rotation 0..2, position 3..5, offset 6, rate 7, log focal length 8, k1 9, readout 10; for
-a lens that was not measured also the principal point 11, 12, k2 13, k3 14, log fy/fx 15 and, for a pinhole lens, p1, p2
-16, 17."""
-OFFSET, RATE, FOCAL, K1, READOUT, CENTRE, K2, K3, ASPECT, P1 = 6, 7, 8, 9, 10, 11, 13, 14, 15, 16  # columns of a camera
+"""Columns of one camera: rotation 0..2, position 3..5, and those of `Column`."""
 CRYSTAL_RATE_STD = 1.4e-4
 """Prior std of one crystal's rate against another's: each is within 100 ppm."""
 LARGE_NETWORK = 24
 """Cameras above which a network is a chain rather than a room: up to there all pairs take less than the adjustment.
 Rooms of 26 and 32 cameras come out the same to a micrometre either way, in 2 to 12 % less CPU."""
+
+
+class Column:
+    """Columns of one camera after its pose. FOCAL: log focal length. CENTRE: principal point, two. ASPECT: log fy/fx.
+
+    From CENTRE on they are for a lens that was not measured; P1, two, for a pinhole lens.
+    """
+
+    OFFSET, RATE, FOCAL, K1, READOUT = 6, 7, 8, 9, 10
+    CENTRE, K2, K3, ASPECT, P1 = 11, 13, 14, 15, 16
+    LENS = (FOCAL, K1, CENTRE, CENTRE + 1, K2, K3, ASPECT, P1, P1 + 1)
+    """Of a lens that is estimated; a fisheye lens has no P1, P1 + 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -337,14 +346,16 @@ class Problem:
             if self.free_parameters.pose:
                 columns += range(base, base + 6)
             if self.free_parameters.clock and camera != self.clock_reference:
-                columns += [base + OFFSET, base + RATE]
+                columns += [base + Column.OFFSET, base + Column.RATE]
             prior = self.lens_prior(camera)
             if self.free_parameters.lens or prior is not None:
-                columns += [base + FOCAL, base + K1][: 1 if prior is not None and prior.focal_only else 2]
+                columns += [base + Column.FOCAL, base + Column.K1][: 1 if prior is not None and prior.focal_only else 2]
             if self.is_readout_free(camera):
-                columns.append(base + READOUT)
+                columns.append(base + Column.READOUT)
             if prior is not None and not prior.focal_only:
-                columns += range(base + CENTRE, base + (P1 if self.nominal[camera].fisheye else CAMERA_PARAMETERS))
+                columns += range(
+                    base + Column.CENTRE, base + (Column.P1 if self.nominal[camera].fisheye else CAMERA_PARAMETERS)
+                )
         found = np.array(columns, dtype=np.int64)
         found.flags.writeable = False
         return found

@@ -12,22 +12,7 @@ from itertools import accumulate
 
 import numpy as np
 
-from hub.bundle.problem import (
-    ASPECT,
-    CENTRE,
-    FOCAL,
-    K1,
-    K2,
-    K3,
-    OFFSET,
-    P1,
-    RATE,
-    READOUT,
-    CameraState,
-    TrackObservations,
-    Trajectory,
-    UsedRows,
-)
+from hub.bundle.problem import CameraState, Column, TrackObservations, Trajectory, UsedRows
 from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SplineBasis, weighted_sums
 from protocols.geometry import kernels
@@ -147,7 +132,7 @@ def evaluate_labels(rows: UsedRows, camera: CameraState, paths: StackedTrajector
     evaluation = evaluate_points(camera, points, inside, time, rows.pixels, support, rows.relative_information)
     if rows.along_std is None:
         return evaluation
-    velocity = jacobians(evaluation, camera, [OFFSET])[:, 3]
+    velocity = jacobians(evaluation, camera, [Column.OFFSET])[:, 3]
     direction = velocity / np.maximum(np.linalg.norm(velocity, axis=0), 1e-9)
     return replace(evaluation, along=(direction, 1.0 / rows.along_std))
 
@@ -209,9 +194,9 @@ def _project(camera: CameraState, points: Floats, inside: Bools) -> tuple[Floats
 def jacobians(evaluation: ResidualEvaluation, camera: CameraState, columns: Sequence[int]) -> Floats:
     """Jacobian (2, 3 + columns, n) of the residuals by the point and by the given camera parameter columns."""
     out, velocity = np.empty((2, 3 + len(columns), len(evaluation.time))), None
-    if not {OFFSET, RATE, READOUT}.isdisjoint(columns):
+    if not {Column.OFFSET, Column.RATE, Column.READOUT}.isdisjoint(columns):
         velocity = weighted_sums(evaluation.control, evaluation.index, evaluation.slope_weights).T
-    place = np.array([3 + columns.index(k) if k in columns else -1 for k in range(OFFSET)])
+    place = np.array([3 + columns.index(k) if k in columns else -1 for k in range(Column.OFFSET)])
     if kernels.AVAILABLE and evaluation.distortion_jacobian is not None:
         rows = evaluation.camera_points, evaluation.normalised, evaluation.distortion_jacobian, evaluation.valid
         by_time = kernels.pose_jacobians(camera.pose.rotation, camera.intrinsics.matrix, rows, velocity, place, out)
@@ -219,14 +204,14 @@ def jacobians(evaluation: ResidualEvaluation, camera: CameraState, columns: Sequ
         by_time = _pose_jacobians(evaluation, camera, velocity, place, out)
     radius2 = None
     for column, values in zip(columns, out[:, 3:].transpose(1, 0, 2), strict=True):
-        if column in (OFFSET, RATE, READOUT):
+        if column in (Column.OFFSET, Column.RATE, Column.READOUT):
             factor: Floats | float = 1.0
-            if column == RATE:
+            if column == Column.RATE:
                 factor = evaluation.time - camera.centre
-            elif column == READOUT:
+            elif column == Column.READOUT:
                 factor = camera.rate * camera.row_offset(evaluation.pixels)
             np.multiply(by_time, factor, out=values)
-        elif column > OFFSET:
+        elif column > Column.OFFSET:
             if radius2 is None:
                 radius2 = (evaluation.normalised**2).sum(axis=0)
             values[:] = _lens_jacobian(evaluation, camera.intrinsics, column, radius2)
@@ -264,20 +249,20 @@ def _pose_jacobians(
 def _lens_jacobian(evaluation: ResidualEvaluation, lens: Intrinsics, column: int, radius2: Floats) -> Floats:
     """Jacobian (2, n), or an array that broadcasts to it, by one intrinsic parameter."""
     matrix, normalised = lens.matrix[:2, :2], evaluation.normalised
-    if column in (CENTRE, CENTRE + 1):
-        return np.eye(2)[:, column - CENTRE, None]
-    if column in (FOCAL, ASPECT):
+    if column in (Column.CENTRE, Column.CENTRE + 1):
+        return np.eye(2)[:, column - Column.CENTRE, None]
+    if column in (Column.FOCAL, Column.ASPECT):
         from_centre = evaluation.residual + evaluation.pixels.T - lens.matrix[:2, 2:]
-        return from_centre if column == FOCAL else from_centre * np.array([[-0.5], [0.5]])
-    if column >= P1:
+        return from_centre if column == Column.FOCAL else from_centre * np.array([[-0.5], [0.5]])
+    if column >= Column.P1:
         if lens.fisheye:
             return np.zeros((2, 1))
         x, y = normalised
         cross = 2 * x * y
         return np.asarray(
-            matrix @ (np.stack([cross, radius2 + 2 * y * y] if column == P1 else [radius2 + 2 * x * x, cross]))
+            matrix @ (np.stack([cross, radius2 + 2 * y * y] if column == Column.P1 else [radius2 + 2 * x * x, cross]))
         )
-    power = {K1: 0, K2: 1, K3: 2}[column]
+    power = {Column.K1: 0, Column.K2: 1, Column.K3: 2}[column]
     if not lens.fisheye:
         return np.asarray(matrix @ (normalised * radius2 ** (power + 1)))
     radius = np.sqrt(radius2)

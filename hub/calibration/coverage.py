@@ -133,7 +133,7 @@ def camera_advice(camera: str, frames: int, rows: int, covered: Bools, target: s
         return CoverageAdvice(camera, "unseen", 0.0, (), f"{camera} has not seen the {target} yet: {do} in front of it")
     percent = f"{camera} has seen the {target} in {100 * share:.0f} % of its view"
     if share < MIN_COVERAGE:
-        aim = f" at the {_listed(regions[:2])} of its picture" if regions else ""
+        aim = f" at the {' and the '.join(regions[:2])} of its picture" if regions else ""
         return CoverageAdvice(camera, "narrow", share, regions, f"{percent}: {do}{aim}")
     if rows < MIN_DETECTIONS:
         text = f"{camera} has seen the {target} in {rows} frames only: {do} there for longer"
@@ -201,7 +201,3 @@ def uncovered_regions(covered: Bools) -> tuple[str, ...]:
 def _most_urgent(found: list[CoverageAdvice], max_advice: int) -> list[CoverageAdvice]:
     order: dict[Kind, int] = {"silent": 0, "unseen": 1, "narrow": 2, "few": 3}
     return sorted(found, key=lambda advice: (order[advice.kind], advice.coverage, advice.camera))[:max_advice]
-
-
-def _listed(words: tuple[str, ...]) -> str:
-    return " and the ".join(words)

@@ -14,11 +14,10 @@ from typing import Literal
 import numpy as np
 
 from hub.bundle.preprocessing import PreparedSession, prepare
-from hub.calibration.acceptance import LAG_CONFLICT
+from hub.calibration.acceptance import LAG_CONFLICT, check_stature
 from hub.calibration.pairs.moved_pair import likely_maps, moves_of_two, time_map_between
 from hub.calibration.pairs.pair_network import Progress, frame_rate_warnings, solve_pairs
 from hub.calibration.pairs.pair_reports import isolated_pair_report
-from hub.calibration.people.stature import check_stature
 from hub.calibration.resection.moved_cameras import Move, moved_cameras, without_moved
 from hub.calibration.resection.set_clocks import between_settings, set_clocks
 from hub.calibration.result import assemble_calibration
@@ -149,7 +148,7 @@ def calibrate(
 
 def _have_sizes(prepared: PreparedSession, observations: Observations) -> bool:
     """Whether all rows have sizes."""
-    from hub.baselines.session_poses import all_tracks_have_sizes  # the other solvers do not need to load it
+    from hub.baselines.recursive_poses import all_tracks_have_sizes  # the other solvers do not need to load it
 
     return all_tracks_have_sizes(prepared, observations)
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hub.bundle import covariance as cov
-from hub.bundle.datum.control_outliers import reject_outliers, reject_refuted
-from hub.bundle.datum.control_point_adjustment import adjust_to_control_points
+from hub.bundle.datum.control_outliers import adjust_to_control_points, reject_outliers, reject_refuted
 from hub.bundle.datum.gauge import (
     at_control_points,
     fix_gauge,
@@ -23,10 +22,10 @@ from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation
 from hub.bundle.noise.noise_scale import rescale_noise
 from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
 from hub.bundle.preprocessing import PreparedSession
-from hub.bundle.problem import FOCAL, LARGE_NETWORK, READOUT, AdjustmentState, Problem
+from hub.bundle.problem import LARGE_NETWORK, AdjustmentState, Column, Problem
 from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import estimate_smoothness
-from hub.calibration.given_values import refuted_lens_warnings, sensitivities
+from hub.calibration.given_values import measure_scale_bars, refuted_lens_warnings, scaled_by_bars, sensitivities
 from hub.calibration.notes import (
     clock_step_warnings,
     estimated_lenses,
@@ -41,7 +40,6 @@ from hub.calibration.notes import (
     wrong_detector_stds,
 )
 from hub.calibration.pairs.pair_reports import pair_report
-from hub.calibration.scale_bar import measure_scale_bars, scaled_by_bars
 from hub.calibration.solvers import Solution
 from hub.trajectory.discrete import INSTANT_TOLERANCE_S, PointBasis
 from protocols.core.clocks import TimeMap
@@ -114,7 +112,7 @@ def assemble_calibration(
     scaled = rescale_noise(noisy, scaled, prior)
     covariance = cov.covariance(noisy, scaled, prior, gauge.information, datum_points, gauge.exact)
     effects = sensitivities(rig, names, noisy, scaled, prior, covariance)
-    lens_stds, readout_stds = np.sqrt(np.maximum(covariance.variances[:, [FOCAL, READOUT]], 0.0)).T
+    lens_stds, readout_stds = np.sqrt(np.maximum(covariance.variances[:, [Column.FOCAL, Column.READOUT]], 0.0)).T
     time_origins = [solution.prepared.time_origins[name] for name in names]
     time_scales = [solution.prepared.time_scale(name) for name in names]
     base = state.cameras[reference]

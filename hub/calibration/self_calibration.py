@@ -16,7 +16,7 @@ import numpy as np
 
 from hub.bundle.initialisation import CameraInput
 from hub.bundle.preprocessing import PreparedSession
-from hub.bundle.problem import LensPrior, TrackObservations
+from hub.bundle.problem import LensPrior
 from hub.sync.hypothesis import PairFit, PairSolution
 from hub.sync.pair_solver import solve_pair
 from hub.sync.settings import PairSettings
@@ -106,7 +106,8 @@ def initial_focal_lengths(
         scaled[:, :, :2] *= factor[first][:, None, None]
         values = np.linalg.svd(scaled, compute_uv=False)
         imbalance = (values[:, 0] - values[:, 1]) / (values[:, 0] + values[:, 1])
-        return np.concatenate([_cauchy_residual(imbalance / _SINGULAR_VALUE_NOISE), (log_focal - mean) / std])
+        # Cauchy's loss as a residual, robust against pairs with a wrong matrix.
+        return np.concatenate([np.sqrt(np.log1p((imbalance / _SINGULAR_VALUE_NOISE) ** 2)), (log_focal - mean) / std])
 
     from scipy.optimize import least_squares  # a tenth of a second to import, only needed without measured lenses
 
@@ -150,11 +151,6 @@ def _lens_changed(prepared: PreparedSession, name: str, lens: Intrinsics) -> boo
     return bool(np.sqrt(np.mean((np.concatenate(current) - np.concatenate(again)) ** 2)) > _PIXEL_TOLERANCE)
 
 
-def _cauchy_residual(ratio: Floats) -> Floats:
-    """Cauchy loss as a residual, robust against pairs with a wrong matrix."""
-    return np.asarray(np.sqrt(np.log1p(ratio**2)))
-
-
 def _with_focal(lens: Intrinsics, focal: float) -> Intrinsics:
     matrix = lens.matrix.copy()
     matrix[:2, :2] *= focal / lens.focal
@@ -167,14 +163,10 @@ def with_lens(prepared: PreparedSession, name: str, lens: Intrinsics, prior: Len
     tracks = dict(camera.tracks)
     for part in prepared.rows_through(name, lens):
         label = prepared.labels[part.label]
-        smooth = _smooth(part, lens)
+        smooth = smooth_track(part.time, lens.unproject(part.pixels), lens.focal, 0.0, part.relative_std)
         if smooth is not None:
             tracks[label] = smooth
     return CameraInput(name, lens, tracks, prior, stated_std=camera.stated_std)
-
-
-def _smooth(part: TrackObservations, lens: Intrinsics) -> SmoothTrack | None:
-    return smooth_track(part.time, lens.unproject(part.pixels), lens.focal, 0.0, part.relative_std)
 
 
 def _with_relative_pose(

@@ -65,7 +65,7 @@ class Solution:
 
 def paper_pairs(prepared: PreparedSession, observations: Observations, report: Progress) -> list[PairSolution]:
     """All pairs by the asynchronous calibration paper's method. Raises Refused for a shared clock (no lags)."""
-    from hub.baselines.session_lags import solve_pair_by_paper
+    from hub.baselines.alternating_lag import solve_pair_by_paper
 
     if prepared.shared_clock:
         raise Refused('the paper\'s method finds lags, and clock = "shared" says there are none', {})
@@ -271,7 +271,7 @@ def solve_paper(
             prepared.cameras, graph, prepared.rows, prepared.labels, free_parameters=None
         )
     else:
-        from hub.baselines.session_poses import reconstruct_by_paper
+        from hub.baselines.recursive_poses import reconstruct_by_paper
 
         reconstruction, unplaced = reconstruct_by_paper(rig, prepared, sized, graph)
     if prepared.shared_clock:

@@ -11,11 +11,9 @@ from dataclasses import replace
 
 from google.protobuf.message import Message
 
-from hub.clocks.arrival_prior import ArrivalPriors
 from hub.clocks.change_detector import ClockChange
-from hub.clocks.external_prior import ExternalClockPrior, ExternalClockPriors
-from hub.clocks.rate_change import RateChanges
-from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments
+from hub.clocks.external_prior import ArrivalPriors, ExternalClockPrior, ExternalClockPriors
+from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments, RateChanges
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.detections import tracked_kind
 from protocols.core.clocks import NANOSECONDS

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from hub.clocks.external_prior import ExternalClockPrior
-from protocols.core.pair_report import PairReport
+from protocols.core.acceptance import PairReport
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration
 

@@ -129,7 +129,8 @@ def _join_worlds(parts: Sequence[Calibration]) -> tuple[list[Similarity], Floats
     for _ in range(_ROUNDS if both else 0):
         rows, residuals, stds = [], [], []
         for a, b, shared in both:
-            ends = [found[i].points(_centres(parts[i], shared)) for i in (a, b)]
+            centres = {i: np.array([parts[i].cameras[name].pose.position for name in shared]) for i in (a, b)}
+            ends = [found[i].points(places) for i, places in centres.items()]
             row = np.zeros((3 * len(shared), 7 * len(parts)))
             for i, sign, points in ((a, 1.0, ends[0]), (b, -1.0, ends[1])):
                 row[:, 7 * i : 7 * i + 7] = sign * _motions(points)
@@ -264,10 +265,6 @@ def _on_clock_of(site: Calibration, last: Calibration | None, same_clock: Sequen
 
 def _poses(part: Calibration) -> dict[str, Pose]:
     return {name: camera.pose for name, camera in part.cameras.items()}
-
-
-def _centres(part: Calibration, names: Sequence[str]) -> Floats:
-    return np.array([part.cameras[name].pose.position for name in names])
 
 
 def _markers(poses: Sequence[Pose]) -> Floats:

@@ -14,15 +14,13 @@ from google.protobuf.message import Message
 
 from hub.calibration.resection.unconnected import listed
 from hub.distributed.network.host import ROLE as NODES
-from hub.live.fair_share import FairShare
+from hub.live.fair_share import FairShare, Shedding
 from hub.live.live_hub import SILENT_S, LiveHub
 from hub.live.messages import rig_message
 from hub.live.shard import ROLE as SHARDS
 from hub.live.shard import Shard
-from hub.live.shedding import Shedding
-from protocols.bus.base import Bus, Publisher, Received
+from protocols.bus.base import Bus, Publisher, Received, agent_status
 from protocols.bus.commands import CommandSubscription
-from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import Rig
 from protocols.topics import (
@@ -40,7 +38,6 @@ from protocols.topics import (
     TRACK_SMOOTHED,
     Topic,
 )
-from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "hub"
 _TICK_S = 0.05  # s: of the hub's loop, below a frame at 15 Hz
@@ -270,16 +267,8 @@ def status_message(
 ) -> pb.AgentStatus:
     """The hub's status at ``now``: counters, gauges, and one line of text."""
     state, text = hub.state(now)
-    message = pb.AgentStatus(
-        schema_version=SCHEMA_VERSION,
-        agent=agent,
-        role=ROLE,
-        boot_id=boot,
-        sequence=sequence,
-        state="running" if state == "calibrated" else "degraded" if state == "degraded" else "starting",
-        message=text,
-        version=VERSION,
-    )
+    word = "running" if state == "calibrated" else "degraded" if state == "degraded" else "starting"
+    message = agent_status(ROLE, agent, boot, sequence, word, text)
     for name, count in hub.counters.items():
         message.counters[name] = count
     for kind, of_cameras in (("over_budget", hub.budgets.counts), ("fault", hub.links.faults)):

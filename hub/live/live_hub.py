@@ -22,10 +22,9 @@ from hub.distributed.network.host import NodeHost
 from hub.distributed.solver import node_calibration
 from hub.live.budgets import CameraBudgets
 from hub.live.camera_links import CameraLinks
-from hub.live.job_schedule import JobSchedule
 from hub.live.messages import calibration_message, refusal_message, solver_event
 from hub.live.reloaded import VERIFY_ROWS, ReloadedCalibration
-from hub.live.solver import InlineSolver, Solver, SolverAnswer, SolverJob
+from hub.live.solver import InlineSolver, JobSchedule, Solver, SolverAnswer, SolverJob
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.live_tracking import LiveTracking
 from protocols.core.errors import InputError, Refused

@@ -31,7 +31,6 @@ def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[
         solver=calibration.solver,
     )
     for name, camera in calibration.cameras.items():
-        lens = camera.intrinsics
         message.cameras.append(
             pb.CameraCalibration(
                 camera=name,
@@ -42,9 +41,7 @@ def calibration_message(calibration: Calibration, revision: int, boot_ids: dict[
                 time_offset_std=camera.lag_std,
                 position_std=camera.position_std.tolist(),
                 rms_px=camera.rms_px,
-                matrix=lens.matrix.ravel().tolist(),
-                distortions=lens.distortions.tolist(),
-                fisheye=lens.fisheye,
+                **camera.intrinsics.message_fields(),
                 boot_id=boot_ids.get(name, ""),
                 lag_time_s=camera.lag_time,
                 clock_rate_std=camera.clock_rate_std,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.clocks.arrival_prior import ERROR_BOUND_S
+from hub.clocks.external_prior import ERROR_BOUND_S
 from hub.live.camera_links import CameraLinks
 from protocols.core.clocks import TimeMap
 from protocols.session.calibration import Calibration, CameraCalibration

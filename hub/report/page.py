@@ -5,8 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
-from hub.report import convergence, image_maps, measures, pair_graph, rig_figure, tables, time_figures
-from hub.report.convergence import OffsetStdSample
+from hub.report import image_maps, measures, pair_graph, rig_figure, tables, time_figures
 from hub.report.measures import RowUsage
 from hub.report.quality_assessment import (
     UNIT_WORDS,
@@ -18,6 +17,7 @@ from hub.report.quality_assessment import (
 )
 from hub.report.style import STYLE
 from hub.report.svg import THIN, esc, number, short, whole
+from hub.report.time_figures import OffsetStdSample
 from hub.report.wording import in_words_of
 from protocols.core.errors import Refused
 from protocols.core.version import VERSION
@@ -255,8 +255,8 @@ def _pairs(calibration: Calibration) -> str:
 
 
 def _convergence(calibration: Calibration, rig: Rig, history: tuple[OffsetStdSample, ...]) -> str:
-    steps = convergence.adjustment_history(calibration.convergence)
-    clocks = "" if rig.shared_clock else convergence.offset_std_history(history, calibration.reference)
+    steps = time_figures.adjustment_history(calibration.convergence)
+    clocks = "" if rig.shared_clock else time_figures.offset_std_history(history, calibration.reference)
     return "".join(
         f'<p class="lead">{lead}</p>{figure}'
         for lead, figure in (

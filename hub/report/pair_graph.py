@@ -6,8 +6,8 @@ import numpy as np
 
 from hub.report.quality_assessment import is_contradicting
 from hub.report.svg import THIN, at, drawing, esc, line, number, rect, text
+from protocols.core.acceptance import PairReport
 from protocols.core.errors import Refused
-from protocols.core.pair_report import PairReport
 from protocols.session.calibration import Calibration
 
 _MAX_LABELS = 15  # more labels than this would overlap
@@ -41,7 +41,8 @@ def draw_pair_graph(calibration: Calibration) -> str:
         tip = f"{pair.cameras[0]}–{pair.cameras[1]}: {pair.status}"
         parts.append(f"<g><title>{esc(tip)}</title>{line(x1, y1, x2, y2, f'edge {kind}')}</g>")
         if kind != "refused" and pair.lag_s is not None and len(connected) <= _MAX_LABELS:
-            share = _label_share(abs(i - j), len(names))
+            # Chords cross in the middle: their labels are off it.
+            share = 0.5 if len(names) < 4 or abs(i - j) in (1, len(names) - 1) else 0.3
             x, y = x1 + share * (x2 - x1), y1 + share * (y2 - y1)
             lag = f"{number(pair.lag_s, 3, sign=True)}{THIN}s"
             half = 3.9 * len(lag) + 3
@@ -100,11 +101,6 @@ def _node_positions(count: int, width: float, height: float) -> list[tuple[float
     x = width / 2 + (width / 2 - 60) * across / np.abs(across).max()
     y = height / 2 + (height / 2 - 34) * down / np.abs(down).max()
     return [(float(a), float(b)) for a, b in zip(x, y, strict=True)]
-
-
-def _label_share(separation: int, count: int) -> float:
-    """Position of the lag label along an edge: off-centre for chords, which cross in the middle."""
-    return 0.5 if count < 4 or separation in (1, count - 1) else 0.3
 
 
 def _node(name: str, x: float, y: float, refused: bool) -> str:

@@ -8,10 +8,10 @@ from typing import Literal
 
 from hub.report import measures
 from hub.report.measures import RowUsage
-from hub.report.remedies import remedy_for
 from hub.report.svg import THIN, number, short
+from hub.report.wording import remedy_for
+from protocols.core.acceptance import PairReport
 from protocols.core.errors import Refused
-from protocols.core.pair_report import PairReport
 from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig

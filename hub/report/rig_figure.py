@@ -156,7 +156,8 @@ def rig_figure_script(figure: RigFigure) -> str:
         "resetCameraDefault3d",
     ]  # no button that sends data elsewhere
     config = {"displaylogo": False, "responsive": True, "modeBarButtons": [buttons]}
-    arguments = ",".join(_script_safe(part) for part in (data, layout, config))
+    texts = (json.dumps(part, separators=(",", ":"), allow_nan=False) for part in (data, layout, config))
+    arguments = ",".join(texts).replace("<", "\\u003c")  # safe inside a <script> element
     return f'Plotly.newPlot("{DIV}",{arguments});'
 
 
@@ -194,11 +195,6 @@ def _trace(rows: Rows, mode: str, name: str, **more: Any) -> dict[str, Any]:
 
 def _round(value: float) -> float:
     return float(f"{value:.5g}") + 0.0
-
-
-def _script_safe(value: Any) -> str:
-    """JSON that is safe inside a <script> element."""
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
 def plan_and_side(figure: RigFigure) -> str:

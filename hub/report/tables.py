@@ -10,8 +10,8 @@ import numpy as np
 from hub.report.measures import RowUsage
 from hub.report.pair_graph import edge_kind
 from hub.report.quality_assessment import capital, half_interval_ms
-from hub.report.remedies import remedy_for
 from hub.report.svg import THIN, esc, number, short, whole
+from hub.report.wording import remedy_for
 from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration

@@ -152,6 +152,9 @@ class Samples:
         front = relative_pose.in_front(geometry, inlier_a, inlier_b)
         seconds = float(count) * self.seconds_per_sample
         inliers = float(inlier.mean())
+        ends = inlier_a * focal_a, inlier_b * focal_b
+        # From a to b and back, of which the less counts: edge-on planes magnify noise.
+        planar = [relative_pose.homography_residual(*both) for both in (ends, ends[::-1])]
         return PairFit(
             rate=rate,
             offset=offset,
@@ -166,7 +169,7 @@ class Samples:
             parallax=relative_pose.parallax(geometry, a, b),
             track_noise_px=track_noise,
             misfit=float((smoothed[inlier] ** 2).mean()) if inlier.any() else np.inf,
-            planar_residual_px=_planar_residual_px(inlier_a * focal_a, inlier_b * focal_b),
+            planar_residual_px=min(planar),
         )
 
 
@@ -189,8 +192,3 @@ def _mean_interval(time: Floats) -> float:
     steps = time[1:] - time[:-1]
     short = steps[steps <= _MAX_INTERVAL_RATIO * median(steps)]
     return float(short.sum()) / len(short)
-
-
-def _planar_residual_px(a: Floats, b: Floats) -> float:
-    """Residual of the best homography [px], from a to b or back, whichever is less: edge-on planes magnify noise."""
-    return min(relative_pose.homography_residual(a, b), relative_pose.homography_residual(b, a))

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from hub.tracking.association.assignment import colour_score, matching_colour_std
@@ -207,7 +205,8 @@ class BatchSmoother:
         found = self.evidence[index].total.of(_places(self.evidence[index].row, rows))
         prior = np.linalg.inv(covariance)
         vector = (prior @ mean[:, :, None])[:, :, 0] + found.vector
-        covariance = _symmetric(np.linalg.inv(prior + found.information))
+        inverse = np.linalg.inv(prior + found.information)
+        covariance = 0.5 * (inverse + inverse.transpose(0, 2, 1))
         return (covariance @ vector[:, :, None])[:, :, 0], covariance
 
     def _associate(self, forward: list[_Filtered], backward: list[_Filtered], relink: bool) -> list[SmoothedScan]:
@@ -485,7 +484,3 @@ def _places(rows: Ints, wanted: Ints) -> Ints:
     """Where each of ``wanted`` is in ``rows``, -1 = nowhere."""
     place = {track: at for at, track in enumerate(rows.tolist())}
     return np.array([place.get(track, -1) for track in wanted.tolist()], dtype=np.int64)
-
-
-def _symmetric(matrix: npt.NDArray[np.floating[Any]]) -> Floats:
-    return np.asarray(0.5 * (matrix + matrix.transpose(0, 2, 1)))

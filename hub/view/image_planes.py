@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hub.view.page import draw_detections
-from hub.view.scene_renderer import decode_rgb
+from hub.view.scene_renderer import decode_rgb, set_viewpoint
 from hub.view.state import ViewState
 from protocols.geometry.types import Floats
 
@@ -76,12 +76,7 @@ class ImagePlanes:
         middle = 0.5 * (max(count, 1) - 1) * (_WIDTH + _GAP)
         place, up = (middle, 0.0, -0.72 * max(count, 1) - 0.2), (0.0, -1.0, 0.0)
         self._server.scene.set_up_direction(up)
-        start = self._server.initial_camera
-        start.position, start.look_at, start.up = place, (middle, 0.0, 0.0), up
-        for client in self._server.get_clients().values():
-            client.camera.up_direction = up
-            client.camera.position = place
-            client.camera.look_at = (middle, 0.0, 0.0)
+        set_viewpoint(self._server, np.array(place), np.array([middle, 0.0, 0.0]), np.array(up))
 
     def _click(self, name: str, index: int, event: Any) -> None:
         pixel = pixel_of(np.array(event.ray_origin), np.array(event.ray_direction), index, self._sizes[name])

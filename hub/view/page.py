@@ -11,8 +11,7 @@ from hub.view.lag_chart import lag_charts
 from hub.view.panels import camera_details, camera_table, overview, picture_tiles, recording_html
 from hub.view.scene_renderer import DisplayOptions, decode_rgb
 from hub.view.state import CameraView, ViewState
-from hub.view.uav_overlay import draw_uav, pad_to_aspect, uav_panel_html
-from hub.view.uav_state import UavView
+from hub.view.uav_overlay import UavView, draw_uav, pad_to_aspect, uav_panel_html
 from protocols.session.builder import rig_camera_from_info
 from protocols.session.calibration import calibration_text
 from protocols.session.rig import Rig

@@ -12,26 +12,13 @@ from google.protobuf.message import Message
 
 from hub.live.messages import calibration_message, track_messages
 from hub.view.lag_history import LAG_WINDOW_S
-from hub.view.state import ViewState
+from hub.view.state import LATCHED, ON_IMAGES, TOPICS, ViewState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.calibration import Calibration, read_calibration, stated_calibration
-from protocols.session.trajectory import read_trajectory
-from protocols.topics import (
-    CALIBRATION,
-    CAMERA_INFO,
-    FLIGHT_IMAGE,
-    OBSERVATION,
-    PICTURE,
-    ROAD_MAP,
-    STATUS,
-    TARGET,
-    TARGET_CLOUD,
-    TRACK,
-    UAV_INFO,
-)
+from protocols.session.calibration import Calibration, read_calibration, read_trajectory, stated_calibration
+from protocols.topics import FLIGHT_IMAGE, PICTURE
 from protocols.validation.rules import SCHEMA_VERSION
 
 CONTEXT_S = 20.0
@@ -39,11 +26,6 @@ CONTEXT_S = 20.0
 
 Timed = tuple[float, Message]
 """Seconds since the start of the recording, and a message."""
-
-
-_LATCHED = (CAMERA_INFO, CALIBRATION, STATUS, UAV_INFO)
-_TOPICS = [*_LATCHED, OBSERVATION, TRACK, TARGET]
-_IMAGE_TOPICS = [PICTURE, FLIGHT_IMAGE, TARGET_CLOUD, ROAD_MAP]
 
 
 class Recording(Protocol):
@@ -69,10 +51,10 @@ class LogRecording:
         self._latched: list[Timed] = []
         first: int | None = None
         last = 0
-        for logged in self._reader.messages(_TOPICS):
+        for logged in self._reader.messages(TOPICS):
             first = logged.log_time_ns if first is None else first
             last = max(last, logged.log_time_ns)
-            if logged.topic in _LATCHED:
+            if logged.topic in LATCHED:
                 self._latched.append(((logged.log_time_ns - first) / NANOSECONDS, logged.message))
         if first is None:
             raise InputError("this log holds nothing to show", file=path, remedy="record cameras or a hub")
@@ -99,7 +81,7 @@ class LogRecording:
     def messages(self, start: float) -> Iterator[Timed]:
         """All messages from ``start`` [s] on."""
         begin = self._first + round(start * NANOSECONDS)
-        for logged in self._reader.messages([*_TOPICS, *_IMAGE_TOPICS], begin):
+        for logged in self._reader.messages([*TOPICS, *ON_IMAGES, PICTURE, FLIGHT_IMAGE], begin):
             yield (logged.log_time_ns - self._first) / NANOSECONDS, logged.message
 
 
@@ -192,7 +174,5 @@ def _info(calibration: Calibration, name: str) -> pb.CameraInfo:
         width=lens.width,
         height=lens.height,
         driver="calibration.toml",
-        matrix=lens.matrix.ravel().tolist(),
-        distortions=lens.distortions.tolist(),
-        fisheye=lens.fisheye,
+        **lens.message_fields(),
     )

@@ -168,13 +168,7 @@ class SceneRenderer:
         if self._framed is None or np.linalg.norm(self._framed[0] - middle) > self._framed[1] / 3:
             # Move the viewpoint only if the scene has moved substantially.
             self._framed = (middle, extent)
-            self._server.initial_camera.position = tuple(eye)
-            self._server.initial_camera.look_at = tuple(middle)
-            self._server.initial_camera.up = tuple(up)
-            for client in self._server.get_clients().values():
-                client.camera.up_direction = tuple(up)
-                client.camera.position = tuple(eye)
-                client.camera.look_at = tuple(middle)
+            set_viewpoint(self._server, eye, middle, up)
 
     def _draw_camera(self, camera: CameraView, pose: Pose, now: float) -> None:
         status = camera.state(now)
@@ -387,6 +381,15 @@ def fit_viewpoint(points: Floats, up: Floats, radius: float) -> tuple[Floats, Fl
     return middle + distance * towards, middle
 
 
+def set_viewpoint(server: viser.ViserServer, eye: Floats, middle: Floats, up: Floats) -> None:
+    """Move the viewpoint of all browsers, and of those that come."""
+    server.initial_camera.position, server.initial_camera.look_at, server.initial_camera.up = eye, middle, up
+    for client in server.get_clients().values():
+        client.camera.up_direction = up
+        client.camera.position = eye
+        client.camera.look_at = middle
+
+
 def _nearest_point(starts: Floats, ends: Floats, tolerance: float) -> Floats | None:
     """Least-squares intersection (3,) of rays (n, 3) to (n, 3), None if a ray misses it by more than ``tolerance``.
 
@@ -415,13 +418,10 @@ def _lens(camera: CameraView) -> Intrinsics | None:
     found, info = camera.calibration, camera.info
     if found is None or len(found.matrix) != 9:
         return None
-    size = (info.width, info.height) if info is not None else _guessed_image_size(found.matrix)
+    matrix = found.matrix  # its principal point is in the middle, where the size is unknown
+    guess = max(round(2 * matrix[2] + 1), 1), max(round(2 * matrix[5] + 1), 1)
+    size = guess if info is None else (info.width, info.height)
     return Intrinsics.of_message(found, size)
-
-
-def _guessed_image_size(matrix: Any) -> tuple[int, int]:
-    """The image size where it is unknown, assuming the principal point at the centre."""
-    return max(round(2 * matrix[2] + 1), 1), max(round(2 * matrix[5] + 1), 1)
 
 
 def _field_of_view(camera: CameraView) -> tuple[float, float]:

@@ -18,24 +18,12 @@ from hub.view.access_control import AccessControl, is_local
 from hub.view.page import ACTIONS, ViewPage
 from hub.view.player import Player, Recording
 from hub.view.scene_renderer import DisplayOptions, SceneRenderer
-from hub.view.state import ViewState
+from hub.view.state import ON_IMAGES, TOPICS, ViewState
 from protocols.bus.base import Bus, Subscription
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.messages import syncline_pb2 as pb
-from protocols.topics import (
-    CALIBRATION,
-    CAMERA_INFO,
-    COMMAND,
-    OBSERVATION,
-    PICTURE,
-    ROAD_MAP,
-    STATUS,
-    TARGET,
-    TARGET_CLOUD,
-    TRACK,
-    UAV_INFO,
-)
+from protocols.topics import COMMAND, PICTURE
 from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "view"
@@ -114,8 +102,7 @@ def run_view(
     a second, and up to 30 while a browser is open."""
     state = ViewState()
     name, boot = f"view-{secrets.token_hex(3)}", uuid.uuid4().hex  # several views may be open on one site
-    topics = (CAMERA_INFO, OBSERVATION, CALIBRATION, TRACK, STATUS, UAV_INFO, TARGET, TARGET_CLOUD, ROAD_MAP)
-    subscriptions = [bus.subscribe(topic) for topic in topics]
+    subscriptions = [bus.subscribe(topic) for topic in (*TOPICS, *ON_IMAGES)]
     commands = bus.publisher(COMMAND, name)
     watch = bus.watch_agents()
     pictures: Subscription | None = None

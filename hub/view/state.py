@@ -15,7 +15,8 @@ from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
 from hub.view.lag_history import LagHistory
-from hub.view.uav_state import UavView
+from hub.view.uav_overlay import UavView
+from protocols import topics
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
@@ -106,6 +107,10 @@ class CameraView:
         return self.verdict
 
 
+LATCHED = (topics.CAMERA_INFO, topics.CALIBRATION, topics.STATUS, topics.UAV_INFO)
+"""Topics of which the last message of each sender is valid until it is replaced."""
+TOPICS = (*LATCHED, topics.OBSERVATION, topics.TRACK, topics.TARGET)
+ON_IMAGES = (topics.TARGET_CLOUD, topics.ROAD_MAP)
 PathPoint = tuple[float, float, float, float, float, float]
 """Reference time [s], x, y, z, std of one axis, 1 if coasting."""
 

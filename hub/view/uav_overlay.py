@@ -1,15 +1,21 @@
-"""Overlay of a drone's image: road, particles and target estimate on a canvas larger than the image."""
+"""Overlay of a drone's image: road, particles and target estimate on a canvas larger than the image.
+
+And the view state of a drone: its last image, and the target, particle and road messages by frame.
+"""
 
 from __future__ import annotations
 
 import html
 import itertools
 import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
-from hub.view.uav_state import UavView
 from protocols.geometry.types import Floats, Image
+from protocols.messages import syncline_pb2 as pb
 
 _MARGIN = 0.35
 """Canvas margin on each side as a fraction of the image: within it an estimate outside the image is drawn at its
@@ -50,9 +56,9 @@ def draw_uav(uav: UavView, picture: Image | None) -> Image:
 
     target, particles, road = uav.at_image()
     if road is not None and len(road.pixels) > 1:
-        _dots(canvas, placed(_pairs(road.pixels)), _ROAD, 2)
+        dots(canvas, placed(_pairs(road.pixels)), _ROAD, 2)
     if particles is not None and target is not None and target.state != "lost" and len(particles.pixels) > 1:
-        _dots(canvas, placed(_pairs(particles.pixels)), _PARTICLES, 3)
+        dots(canvas, placed(_pairs(particles.pixels)), _PARTICLES, 3)
     cv2.rectangle(canvas, (left, top), (left + inner[0] - 1, top + inner[1] - 1), _FRAME, 1)
     if target is not None and len(target.centre) == 2 and target.state != "lost":
         colour = _STATES.get(target.state, _FRAME)
@@ -139,7 +145,7 @@ def _pairs(values: object) -> Floats:
     return np.asarray(numbers[: len(numbers) // 2 * 2].reshape(-1, 2))
 
 
-def _dots(canvas: Image, points: Floats, colour: tuple[int, int, int], size: int) -> None:
+def dots(canvas: Image, points: Floats, colour: tuple[int, int, int], size: int) -> None:
     """Square dots at those points that are on the canvas."""
     height, width = canvas.shape[:2]
     with np.errstate(invalid="ignore"):
@@ -183,3 +189,65 @@ def _arrow(canvas: Image, at: Floats, colour: tuple[int, int, int]) -> None:
     tail = tip - 36.0 * way / length
     start, end = (round(float(tail[0])), round(float(tail[1]))), (round(float(tip[0])), round(float(tip[1])))
     cv2.arrowedLine(canvas, start, end, colour, 3, cv2.LINE_AA, tipLength=0.4)
+
+
+_FrameMessage = TypeVar("_FrameMessage", pb.TargetState, pb.TargetCloud, pb.RoadMap)
+
+
+@dataclass(slots=True, eq=False)
+class UavView:
+    """One UAV agent. pictures: count. full_resolution: its images are those of the tracker, from a log."""
+
+    name: str
+    info: pb.UavInfo | None = None
+    boot: str = ""
+    picture: pb.Picture | None = None
+    pictures: int = 0
+    full_resolution: bool = False
+    targets: deque[pb.TargetState] = field(default_factory=lambda: deque(maxlen=300))
+    particle_sets: deque[pb.TargetCloud] = field(default_factory=lambda: deque(maxlen=50))
+    roads: deque[pb.RoadMap] = field(default_factory=lambda: deque(maxlen=20))
+    last_picture: float | None = None
+    status: pb.AgentStatus | None = None
+
+    def handle(
+        self, message: pb.UavInfo | pb.TargetState | pb.TargetCloud | pb.RoadMap | pb.FlightImage, now: float
+    ) -> None:
+        """Process one message of this agent; a new boot id clears the history."""
+        if message.boot_id != self.boot:
+            self.boot = message.boot_id
+            for history in (self.targets, self.particle_sets, self.roads):
+                history.clear()
+        if isinstance(message, pb.UavInfo):
+            self.info = message
+        elif isinstance(message, pb.TargetState):
+            self.targets.append(message)
+        elif isinstance(message, pb.TargetCloud):
+            self.particle_sets.append(message)
+        elif isinstance(message, pb.RoadMap):
+            self.roads.append(message)
+        else:
+            self.full_resolution = True
+            size = {"width": message.width, "height": message.height, "frame": message.frame}
+            self._show(pb.Picture(camera=message.agent, boot_id=message.boot_id, jpeg=message.jpeg, **size), now)
+
+    def show_thumbnail(self, picture: pb.Picture, now: float) -> None:
+        """Show a thumbnail, unless full-resolution images are available."""
+        if not self.full_resolution:
+            self._show(picture, now)
+
+    def at_image(self) -> tuple[pb.TargetState | None, pb.TargetCloud | None, pb.RoadMap | None]:
+        """The messages of the image's frame, or the last before it: images are rarer and arrive later."""
+        frame = None if self.picture is None else self.picture.frame
+        return _last_up_to(self.targets, frame), _last_up_to(self.particle_sets, frame), _last_up_to(self.roads, frame)
+
+    def _show(self, picture: pb.Picture, now: float) -> None:
+        self.picture, self.pictures, self.last_picture = picture, self.pictures + 1, now
+
+
+def _last_up_to(messages: deque[_FrameMessage], frame: int | None) -> _FrameMessage | None:
+    """The last message of a frame up to ``frame``; the newest if there is no image."""
+    for message in reversed(messages):
+        if frame is None or message.frame <= frame:
+            return message
+    return None

@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Set
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import NamedTuple, Protocol, Self
 
 from google.protobuf.message import Message
 
+from protocols.core.version import VERSION
+from protocols.messages import syncline_pb2 as pb
 from protocols.topics import Topic
+from protocols.validation.rules import SCHEMA_VERSION
 
 
 class BusDead(Exception):
@@ -141,3 +145,20 @@ class Bus(Protocol):
     def __enter__(self) -> Self: ...
 
     def __exit__(self, *_: object) -> None: ...
+
+
+def agent_status(
+    role: str,
+    agent: str,
+    boot_id: str,
+    sequence: int,
+    state: str,
+    text: str,
+    counters: Mapping[str, float] = MappingProxyType({}),
+    gauges: Mapping[str, float] = MappingProxyType({}),
+) -> pb.AgentStatus:
+    """What an agent says of itself; state: starting, running, degraded or stopping."""
+    return pb.AgentStatus(
+        schema_version=SCHEMA_VERSION, version=VERSION, agent=agent, role=role, boot_id=boot_id, sequence=sequence,
+        state=state, message=text, counters=counters, gauges=gauges,
+    )  # fmt: skip

@@ -1,10 +1,13 @@
-"""One named test of an estimate: what was measured, its limit, and where the limit comes from."""
+"""Named tests of an estimate (what was measured, its limit, and where the limit comes from), and reports of pairs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,3 +49,22 @@ class PrecisionTest(AcceptanceTest):
 def first_failure(tests: Iterable[AcceptanceTest]) -> AcceptanceTest | None:
     """The first test that fails; None if all pass."""
     return next((test for test in tests if not test.passed), None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairReport:
+    """One pair of cameras, as in result.json.
+
+    lag_s: t_a - t_b of one instant, at mid-overlap [s]. clock_rate: t_a's rate against t_b. fundamental:
+    (3, 3), undistorted pixels, norm 1, ``m_aᵀ F m_b = 0``, None where unknown. inliers: share, 0..1. acceptance: the
+    tests that were made, in order.
+    """
+
+    cameras: tuple[str, str]
+    status: str
+    lag_s: float | None = None
+    clock_rate: float | None = None
+    fundamental: npt.NDArray[np.float64] | None = None
+    inliers: float | None = None
+    rms_px: float | None = None
+    acceptance: tuple[AcceptanceTest, ...] = ()

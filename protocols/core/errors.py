@@ -12,8 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from protocols.core.acceptance import AcceptanceTest
-from protocols.core.pair_report import PairReport
+from protocols.core.acceptance import AcceptanceTest, PairReport
 
 EXIT_DONE = 0  # the result is there
 EXIT_BUG = 1  # a traceback or a dead process: a supervisor starts it again

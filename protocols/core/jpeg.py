@@ -1,6 +1,9 @@
-"""JPEG images: encoding, and of those that others send the size from the header and decoding within a bound."""
+"""JPEG images: encoding; of those that others send the size from the header, the scale of thumbnails, and decoding
+within a bound."""
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -55,3 +58,29 @@ def decode_jpeg(data: bytes) -> npt.NDArray[np.uint8] | None:
     except cv2.error:
         return None
     return None if image is None else np.asarray(image, np.uint8)
+
+
+class ThumbnailScale(NamedTuple):
+    """Mapping from an image's pixels to its thumbnail's: (u + 0.5) across - 0.5. width, height: of the picture [px]."""
+
+    scale_x: float
+    scale_y: float
+    width: int
+    height: int
+
+    def place(self, u: float, v: float) -> tuple[float, float]:
+        """The thumbnail's pixel of an image's pixel."""
+        return (u + 0.5) * self.scale_x - 0.5, (v + 0.5) * self.scale_y - 0.5
+
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """The mapping as a matrix (3, 3) for homogeneous pixels."""
+        scale_x, scale_y = self.scale_x, self.scale_y
+        return np.array([[scale_x, 0.0, 0.5 * scale_x - 0.5], [0.0, scale_y, 0.5 * scale_y - 0.5], [0.0, 0.0, 1.0]])
+
+
+def thumbnail_scale(picture: Any) -> ThumbnailScale | None:
+    """The mapping of a thumbnail message; None if it is not a JPEG."""
+    size = jpeg_size(picture.jpeg)
+    if size is None or not (picture.width and picture.height):
+        return None
+    return ThumbnailScale(size[0] / picture.width, size[1] / picture.height, *size)

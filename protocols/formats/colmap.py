@@ -99,7 +99,9 @@ def write(cameras: Mapping[str, CameraCalibration]) -> ExportedFiles:
         parameters = _numbers([fx, fy, cx + _CENTRE, cy + _CENTRE, *values])
         lenses.append(f"{number} {model} {lens.width} {lens.height} {parameters}")
         quaternion = so3.quaternion(camera.pose.rotation).tolist()
-        images.append(f"{number} {_numbers([*quaternion, *camera.pose.translation])} {number} {_image(name)}\n")
+        # COLMAP reads an image's name up to the first space: such a name is percent-encoded.
+        image = f"{key_segment(name) if ' ' in name else name}.png"
+        images.append(f"{number} {_numbers([*quaternion, *camera.pose.translation])} {number} {image}\n")
         if camera.time_map.time_offset != 0.0 or camera.time_map.clock_rate != 1.0:
             warnings.append(name)
     text = (f"COLMAP has no clock maps: those of {', '.join(warnings)} are left out",) if warnings else ()
@@ -144,11 +146,6 @@ def _rows(file: Path, keep_empty: bool = False) -> list[tuple[int, list[str]]]:
     text = read_text(file, "file of a COLMAP model saved as text")
     rows = [(number, row.split()) for number, row in enumerate(text.splitlines(), 1) if not row.startswith("#")]
     return rows if keep_empty else [(number, words) for number, words in rows if words]
-
-
-def _image(name: str) -> str:
-    """The image's name of a camera. COLMAP reads it up to the first space: such a name is percent-encoded."""
-    return f"{key_segment(name) if ' ' in name else name}.png"
 
 
 def _name(image: str, taken: Mapping[str, ForeignCamera]) -> str:

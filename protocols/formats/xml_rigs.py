@@ -4,29 +4,50 @@ Qualisys and Vicon give camera centres in millimetres and rotations, camera from
 Pose2Sim's reader. Qualisys' pixels are in 64ths. OptiTrack gives centres in metres and rotations, world from camera,
 row by row; ``IntrinsicStandardCameraModel`` is OpenCV's, ``Intrinsic`` is Motive's own and is not read. The cameras of
 Qualisys and OptiTrack look along -z with y up. Layout: docs.optitrack.com, ".mcal XML Calibration Files".
+
+What else such a system keeps (marker cameras, focus, gain, the wand) is not written: the files carry lenses and poses
+of video cameras to tools that read them, such as Pose2Sim.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
-from protocols.core.errors import InputError
+from protocols.core.errors import InputError, Refused
 from protocols.core.files import read_bytes
 from protocols.core.names import check_name
-from protocols.formats.cameras import ForeignCamera, ForeignRig, parse_array, pinhole_matrix
+from protocols.formats.cameras import (
+    ExportedFiles,
+    ForeignCamera,
+    ForeignRig,
+    check_skew,
+    convert_units,
+    fit_without_k3,
+    parse_array,
+    pinhole_matrix,
+)
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
+from protocols.session.calibration import CameraCalibration
 
-FORMATS = ("qualisys", "vicon", "optitrack")
+UNITS = {"qualisys": "mm", "vicon": "mm", "optitrack": "m"}
+"""Units of lengths by format."""
 _MAX_FILE = 1 << 24  # bytes: of a thousand cameras
-QUALISYS_UNIT = 64.0  # of a pixel: Qualisys counts in 64ths
-FROM_Y_UP = np.diag([1.0, -1.0, -1.0])  # the axes of a camera that looks along -z with y up, to OpenCV's
+_QUALISYS_UNIT = 64.0  # of a pixel: Qualisys counts in 64ths
+_QUALISYS_LENS = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
+_QUALISYS_BENT = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
+_OPTITRACK_MODEL = "IntrinsicStandardCameraModel"
+_OPTITRACK_LENS = ("HorizontalFocalLength", "VerticalFocalLength", "LensCenterX", "LensCenterY")
+_OPTITRACK_BENT = ("k1", "k2", "TangentialX", "TangentialY", "k3")
+_MAX_LOST_PX = 1.0  # px: of tangential distortion that Vicon does not hold
+_FROM_Y_UP = np.diag([1.0, -1.0, -1.0])  # the axes of a camera that looks along -z with y up, to OpenCV's
 
 
 def detect_format(file: Path) -> str | None:
@@ -54,7 +75,7 @@ def read(file: Path, kind: str) -> ForeignRig:
     if not cameras:
         raise InputError("no video camera in it", file=file, remedy="calibrate the video cameras too")
     warnings = (f"marker cameras without video were left out: {', '.join(left_out)}",) if left_out else ()
-    return ForeignRig(cameras, "m" if kind == "optitrack" else "mm", "metric", warnings)
+    return ForeignRig(cameras, UNITS[kind], "metric", warnings)
 
 
 def _root(file: Path) -> ElementTree.Element:
@@ -75,15 +96,13 @@ def _qualisys(root: ElementTree.Element, file: Path) -> Iterator[tuple[str, bool
         name = check_name(tag.get("serial") or tag.get("id") or "", file=file)
         view, lens, place = (_child(tag, key, file, name) for key in ("fov_video", "intrinsic", "transform"))
         left, top, right, bottom = _numbers(view, ("left", "top", "right", "bottom"), file, name)
-        keys = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
-        fu, fv, cu, cv = _numbers(lens, keys, file, name) / QUALISYS_UNIT
-        bent = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
-        distortions = np.r_[_numbers(lens, bent, file, name) / QUALISYS_UNIT, 0.0]
+        fu, fv, cu, cv = _numbers(lens, _QUALISYS_LENS, file, name) / _QUALISYS_UNIT
+        distortions = np.r_[_numbers(lens, _QUALISYS_BENT, file, name) / _QUALISYS_UNIT, 0.0]
         intrinsics = _intrinsics(right - left + 1, bottom - top + 1, (fu, fv, cu - left, cv - top), distortions, file)
         centre = _numbers(place, ("x", "y", "z"), file, name)
         cells = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
         rotation = so3.nearest(_numbers(place, cells, file, name).reshape(3, 3))
-        pose = Pose(FROM_Y_UP @ rotation, centre)
+        pose = Pose(_FROM_Y_UP @ rotation, centre)
         model = tag.get("model", "").lower()
         yield name, "video" in model or "none" in model or not model, ForeignCamera(name, intrinsics, pose)
 
@@ -110,15 +129,13 @@ def _vicon(root: ElementTree.Element, file: Path) -> Iterator[tuple[str, bool, F
 def _optitrack(root: ElementTree.Element, file: Path) -> Iterator[tuple[str, bool, ForeignCamera]]:
     for tag in root.findall("Calibration/Cameras/Camera"):
         name = check_name(tag.get("Serial") or "", file=file)
-        parts = ("Attributes", "IntrinsicStandardCameraModel", "Extrinsic")
-        view, lens, place = (_child(tag, part, file, name) for part in parts)
+        view, lens, place = (_child(tag, part, file, name) for part in ("Attributes", _OPTITRACK_MODEL, "Extrinsic"))
         width, height = _numbers(view, ("ImagerPixelWidth", "ImagerPixelHeight"), file, name)
-        keys = ("HorizontalFocalLength", "VerticalFocalLength", "LensCenterX", "LensCenterY")
-        fu, fv, cu, cv = _numbers(lens, keys, file, name).tolist()
-        distortions = _numbers(lens, ("k1", "k2", "TangentialX", "TangentialY", "k3"), file, name)
+        fu, fv, cu, cv = _numbers(lens, _OPTITRACK_LENS, file, name).tolist()
+        distortions = _numbers(lens, _OPTITRACK_BENT, file, name)
         intrinsics = _intrinsics(width, height, (fu, fv, cu, cv), distortions, file)
         turn = so3.nearest(_numbers(place, [f"OrientMatrix{i}" for i in range(9)], file, name).reshape(3, 3))
-        pose = Pose(FROM_Y_UP @ turn.T, _numbers(place, ("X", "Y", "Z"), file, name))
+        pose = Pose(_FROM_Y_UP @ turn.T, _numbers(place, ("X", "Y", "Z"), file, name))
         yield name, True, ForeignCamera(name, intrinsics, pose)
 
 
@@ -137,9 +154,102 @@ def _child(tag: ElementTree.Element, path: str, file: Path, name: str) -> Elemen
     return found
 
 
-def _numbers(tag: ElementTree.Element, keys: list[str] | tuple[str, ...], file: Path, name: str) -> Floats:
+def _numbers(tag: ElementTree.Element, keys: Sequence[str], file: Path, name: str) -> Floats:
     return parse_array([tag.get(key) for key in keys], (len(keys),), f"{name}'s {', '.join(keys)}", file, None)
 
 
 def _words(tag: ElementTree.Element, key: str, count: int, file: Path, name: str) -> Floats:
     return parse_array((tag.get(key) or "").split(), (count,), f"{name}'s {key}", file, None)
+
+
+def write(kind: str, cameras: Mapping[str, CameraCalibration], units: str, scale: str, name: str) -> ExportedFiles:
+    """One file ``name``. Raises Refused for fisheye lenses, skew, and distortion that the format cannot hold."""
+    converted, warnings = convert_units(cameras, units, UNITS[kind], scale)
+    project = {"qualisys": "Qualisys", "vicon": "Vicon", "optitrack": "OptiTrack"}[kind]
+    for camera in converted.values():
+        check_skew(camera, project)
+        if camera.intrinsics.fisheye:
+            raise Refused(f"{project} holds no fisheye lens, and {camera.name} has one")
+    lost = ["their clocks are not in it"] if any(one.time_map.time_offset for one in cameras.values()) else []
+    writer = {"qualisys": _qualisys_tree, "vicon": _vicon_tree, "optitrack": _optitrack_tree}[kind]
+    root = writer(converted, lost)
+    ElementTree.indent(root)
+    text = '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+    return ExportedFiles({name: text}, (*warnings, *(f"{project}: {one}" for one in lost)))
+
+
+def _qualisys_tree(cameras: Mapping[str, CameraCalibration], lost: list[str]) -> ElementTree.Element:
+    root = ElementTree.Element("calibration")
+    group = ElementTree.SubElement(root, "cameras")
+    for number, (name, camera) in enumerate(cameras.items(), 1):
+        lens, turn = camera.intrinsics, _FROM_Y_UP.T @ camera.pose.rotation
+        bent, warning = fit_without_k3(lens, name, "Qualisys")
+        lost += [warning] if warning else []
+        tag = ElementTree.SubElement(group, "camera", id=str(number), serial=name, model="Video", active="1")
+        tag.set("avg-residual", "0.0")  # Pose2Sim's reader wants one [mm]
+        right, bottom = str(lens.width - 1), str(lens.height - 1)
+        for view in ("fov_marker", "fov_marker_max", "fov_video", "fov_video_max"):
+            ElementTree.SubElement(tag, view, left="0", top="0", right=right, bottom=bottom)
+        cells = {f"r{i + 1}{j + 1}": turn[i, j] for i in range(3) for j in range(3)}
+        _add(tag, "transform", dict(zip("xyz", camera.pose.position, strict=True)) | cells)
+        m, unit = lens.matrix, _QUALISYS_UNIT
+        values = (m[0, 0], m[1, 1], m[0, 2], m[1, 2], *bent)
+        scaled = {key: unit * value for key, value in zip((*_QUALISYS_LENS, *_QUALISYS_BENT), values, strict=True)}
+        _add(tag, "intrinsic", {"focallength": 1.0, "skew": 0.0} | scaled)
+    return root
+
+
+def _vicon_tree(cameras: Mapping[str, CameraCalibration], lost: list[str]) -> ElementTree.Element:
+    root = ElementTree.Element("Cameras", VERSION="1.0")
+    for number, (name, camera) in enumerate(cameras.items(), 1):
+        lens, m = camera.intrinsics, camera.intrinsics.matrix
+        bent, warning = fit_without_k3(lens, name, "Vicon")
+        lost += [warning] if warning else []
+        straight = replace(lens, distortions=np.r_[bent[:2], 0.0, 0.0, 0.0])
+        corners = np.array([[u, v] for u in (0.0, lens.width - 1.0) for v in (0.0, lens.height - 1.0)])
+        rays = np.column_stack([lens.unproject(corners), np.ones(4)])
+        off = float(np.nanmax(np.linalg.norm(straight.project(rays) - corners, axis=1)))
+        if off > _MAX_LOST_PX:
+            raise Refused(f"Vicon holds no tangential distortion, and {name} without it is up to {off:.1f} px off")
+        if np.any(bent[2:]):
+            lost.append(f"{name}'s tangential distortion is not in it, up to {off:.2g} px")
+        tag = ElementTree.SubElement(root, "Camera", DEVICEID=name, USERID=str(number), TYPE="VideoInputDevice")
+        tag.set("SENSOR_SIZE", f"{lens.width} {lens.height}")
+        tag.set("PIXEL_ASPECT_RATIO", _number(m[0, 0] / m[1, 1]))
+        frame = ElementTree.SubElement(
+            ElementTree.SubElement(tag, "KeyFrames"), "KeyFrame", FRAME="0", WORLD_ERROR="0.0"
+        )
+        frame.set("FOCAL_LENGTH", _number(m[0, 0]))
+        frame.set("PRINCIPAL_POINT", _row(m[:2, 2]))
+        frame.set("POSITION", _row(camera.pose.position))
+        frame.set("ORIENTATION", _row(np.roll(so3.quaternion(camera.pose.rotation), -1)))
+        frame.set("VICON_RADIAL", _row(bent[:2]))
+        frame.set("VICON_RADIAL2", f"ViconRadial2 {_row(m[:2, 2])} {_row(bent[:2])} 0")
+    return root
+
+
+def _optitrack_tree(cameras: Mapping[str, CameraCalibration], lost: list[str]) -> ElementTree.Element:
+    root = ElementTree.Element("calibrationProfile", version="1")
+    group = ElementTree.SubElement(ElementTree.SubElement(root, "Calibration"), "Cameras", Count=str(len(cameras)))
+    for name, camera in cameras.items():
+        lens, m, d = camera.intrinsics, camera.intrinsics.matrix, camera.intrinsics.distortions
+        tag = ElementTree.SubElement(group, "Camera", Serial=name)
+        ElementTree.SubElement(tag, "Attributes", ImagerPixelWidth=str(lens.width), ImagerPixelHeight=str(lens.height))
+        values = (m[0, 0], m[1, 1], m[0, 2], m[1, 2], *d)
+        _add(tag, _OPTITRACK_MODEL, dict(zip((*_OPTITRACK_LENS, *_OPTITRACK_BENT), values, strict=True)))
+        turn = (_FROM_Y_UP.T @ camera.pose.rotation).T
+        cells = {f"OrientMatrix{i}": value for i, value in enumerate(turn.ravel())}
+        _add(tag, "Extrinsic", dict(zip("XYZ", camera.pose.position, strict=True)) | cells)
+    return root
+
+
+def _add(parent: ElementTree.Element, name: str, values: Mapping[str, float]) -> None:
+    ElementTree.SubElement(parent, name, {key: _number(value) for key, value in values.items()})
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+def _row(values: Floats) -> str:
+    return " ".join(map(_number, values))

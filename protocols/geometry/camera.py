@@ -52,6 +52,14 @@ class Intrinsics:
         size = [self.width, self.height]
         return {"size": size, "matrix": self.matrix.tolist(), "distortions": self.distortions.tolist(), **fisheye}
 
+    def message_fields(self) -> dict[str, Any]:
+        """Its fields in bus messages, besides the image size."""
+        return {
+            "matrix": self.matrix.ravel().tolist(),
+            "distortions": self.distortions.tolist(),
+            "fisheye": self.fisheye,
+        }
+
     @classmethod
     def of_message(cls, message: Any, size: tuple[int, int] | None = None) -> Intrinsics | None:
         """Those in a bus message with matrix, distortions and fisheye; None where it has none.

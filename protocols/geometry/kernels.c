@@ -791,7 +791,7 @@ static void diagonalise(double matrix[9][9], double basis[9][9])
     }
 }
 
-/* hub.two_view.fundamental.hartley_normalisation of points (2, n) to out; returns the spread. */
+/* hub.two_view.relative_pose.hartley_normalisation of points (2, n) to out; returns the spread. */
 static double hartley(integer n, const double *points, double *out)
 {
     double x = 0.0, y = 0.0, spread = 0.0;

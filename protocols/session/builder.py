@@ -447,17 +447,12 @@ def _shared(motion: dict[str, float]) -> float:
 
 def rig_camera_from_info(info: pb.CameraInfo) -> RigCamera:
     """The rig's entry of a camera, from the CameraInfo that the camera published."""
-    lens = None
-    if len(info.matrix) == 9:
-        matrix = np.array(info.matrix).reshape(3, 3)
-        distortions = np.array(info.distortions) if info.distortions else np.zeros(4 if info.fisheye else 5)
-        lens = Intrinsics(info.width, info.height, matrix, distortions, info.fisheye)
     longest = longest_readout(info.fps)  # a configuration's may be longer than a rig.toml may say
     return RigCamera(
         name=info.camera,
         size=(info.width, info.height),
         fps=info.fps,
-        intrinsics=lens,
+        intrinsics=Intrinsics.of_message(info),
         position=_vector(info.position),
         rotation=None if len(info.rotation) != 3 else so3.exp(np.array(info.rotation)),
         position_std=_vector(info.position_std),

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from protocols.core.acceptance import AcceptanceTest
-from protocols.core.pair_report import PairReport
+from protocols.core.acceptance import AcceptanceTest, PairReport
 from protocols.core.version import VERSION
 from protocols.session.calibration import Calibration, TrajectoryTable, calibration_tables
 from protocols.session.rig import Rig

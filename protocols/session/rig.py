@@ -80,6 +80,17 @@ class RigCamera:
         """Whether the lens was measured: it is given, and no guess (a data sheet's)."""
         return self.intrinsics is not None and self.focal_std <= MEASURED_FOCAL_STD
 
+    def pose_table(self) -> dict[str, Any]:
+        """What is known of pose and uncertainty, as rig.toml and bus messages have it."""
+        rotation = None if self.rotation is None else so3.log(self.rotation)
+        known = {
+            "rotation": rotation,
+            "position": self.position,
+            "position_std": self.position_std,
+            "rotation_std": self.rotation_std,
+        }
+        return {key: value.tolist() for key, value in known.items() if value is not None}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rig:

@@ -6,7 +6,7 @@ that is not plausible (``protocols.core.ranges``) or an array of the wrong lengt
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Sized
 from enum import Enum
 from functools import lru_cache
 from math import inf, isfinite
@@ -99,7 +99,11 @@ def _vector(values: Sequence[float], name: str, lengths: tuple[int, ...], low: f
         _number(value, name, low, high)
 
 
-def _count(things: Sequence[object], name: str, most: int) -> None:
+def _bounded(values: Sequence[float], name: str, lengths: tuple[int, ...], most: float) -> None:
+    _vector(values, name, lengths, -most, most)
+
+
+def _count(things: Sized, name: str, most: int) -> None:
     if len(things) > most:
         raise Rejected(RejectionReason.TOO_MANY, f"{len(things)} {name}, at most {most}")
 
@@ -176,13 +180,13 @@ def _covariance_2d(covariance: Sequence[float]) -> None:
 
 def _intrinsics(message: Any) -> None:
     matrix = message.matrix
-    _vector(matrix, "matrix", (0, 9), -MAX_FOCAL, MAX_FOCAL)
+    _bounded(matrix, "matrix", (0, 9), MAX_FOCAL)
     if matrix and not (matrix[0] >= MIN_FOCAL and matrix[4] >= MIN_FOCAL):
         raise Rejected(RejectionReason.OUT_OF_RANGE, f"a focal length is below {MIN_FOCAL:g} px")
     if matrix and (matrix[3], *matrix[6:]) != (0.0, 0.0, 0.0, 1.0):
         raise Rejected(RejectionReason.OUT_OF_RANGE, "matrix is no camera matrix")
     lengths = (0, 4) if message.fisheye else (0, 4, 5)
-    _vector(message.distortions, "distortions", lengths, -MAX_DISTORTION, MAX_DISTORTION)
+    _bounded(message.distortions, "distortions", lengths, MAX_DISTORTION)
 
 
 _KINDS = frozenset({"marker", "person", "vehicle"})
@@ -215,11 +219,11 @@ def _detection(detection: pb.Detection) -> None:
     if detection.kind:
         _one_of(detection.kind, "kind", _KINDS | {"corner"})
     if detection.head:
-        _vector(detection.head, "head", (2,), -MAX_PIXEL, MAX_PIXEL)
+        _bounded(detection.head, "head", (2,), MAX_PIXEL)
     if detection.foot:
-        _vector(detection.foot, "foot", (2,), -MAX_PIXEL, MAX_PIXEL)
+        _bounded(detection.foot, "foot", (2,), MAX_PIXEL)
     if detection.box:
-        _vector(detection.box, "box", (4,), -MAX_PIXEL, MAX_PIXEL)
+        _bounded(detection.box, "box", (4,), MAX_PIXEL)
         if min(detection.box[2:]) < 0.0:
             raise Rejected(RejectionReason.OUT_OF_RANGE, "a box has a negative side")
     if detection.target:
@@ -227,10 +231,22 @@ def _detection(detection: pb.Detection) -> None:
 
 
 @lru_cache(maxsize=8192)
-def check_names(camera: str, boot_id: str) -> None:
-    """Raise Rejected unless a camera's name and its boot id are valid."""
-    _name(camera, "camera")
+def check_names(camera: str, boot_id: str, field: str = "camera") -> None:
+    """Raise Rejected unless the name of a camera, or of another sender, and its boot id are valid."""
+    _name(camera, field)
     _id(boot_id, "boot id")
+
+
+def _size(message: Any) -> None:
+    _number(message.width, "width", 1, MAX_IMAGE_SIDE)
+    _number(message.height, "height", 1, MAX_IMAGE_SIDE)
+
+
+def _lens(message: Any) -> None:
+    """What is known of a camera's images."""
+    _size(message)
+    _number(message.fps, "fps", 0.0, MAX_FPS)  # 0: not reported by the device
+    _intrinsics(message)
 
 
 def _observation(message: pb.Observation) -> None:
@@ -245,12 +261,8 @@ def _observation(message: pb.Observation) -> None:
 
 
 def _camera_info(message: pb.CameraInfo) -> None:
-    _name(message.camera, "camera")
-    _id(message.boot_id, "boot id")
-    _number(message.width, "width", 1, MAX_IMAGE_SIDE)
-    _number(message.height, "height", 1, MAX_IMAGE_SIDE)
-    _number(message.fps, "fps", 0.0, MAX_FPS)  # 0: not reported by the device
-    _intrinsics(message)
+    check_names(message.camera, message.boot_id)
+    _lens(message)
     _text(message.driver, "driver", MAX_LABEL)
     _text(message.clock, "clock", MAX_LABEL)
     _text(message.target, "target", MAX_LABEL)
@@ -339,8 +351,7 @@ def _solver_event(message: pb.SolverEvent) -> None:
     _number(message.cpu_s, "cpu_s", 0.0)
     _count(message.rows, "runs of rows", MAX_RUNS)
     for rows in message.rows:
-        _name(rows.camera, "camera")
-        _id(rows.boot_id, "boot id")
+        check_names(rows.camera, rows.boot_id)
         if rows.last_sequence < rows.first_sequence:
             raise Rejected(RejectionReason.OUT_OF_RANGE, "a run of rows ends before it begins")
     for priors in (message.clock_priors, message.arrivals):
@@ -383,15 +394,15 @@ def _predicted_target(target: pb.PredictedTarget) -> None:
     _text(target.target, "target", MAX_LABEL)
     if target.kind:
         _one_of(target.kind, "kind", _KINDS)
-    for value, name in ((target.u, "u"), (target.v, "v")):
-        _number(value, name, -MAX_PIXEL, MAX_PIXEL)
-    for value, name in ((target.u_velocity, "u_velocity"), (target.v_velocity, "v_velocity")):
-        _number(value, name)
+    _number(target.u, "u", -MAX_PIXEL, MAX_PIXEL)
+    _number(target.v, "v", -MAX_PIXEL, MAX_PIXEL)
+    _number(target.u_velocity, "u_velocity")
+    _number(target.v_velocity, "v_velocity")
     _covariance_2d(target.covariance)
     _number(target.size, "size", 0.0, MAX_PIXEL)
-    _vector(target.head, "head", (0, 2), -MAX_PIXEL, MAX_PIXEL)
-    _vector(target.foot, "foot", (0, 2), -MAX_PIXEL, MAX_PIXEL)
-    _vector(target.face, "face", (0, 4), -MAX_PIXEL, MAX_PIXEL)
+    _bounded(target.head, "head", (0, 2), MAX_PIXEL)
+    _bounded(target.foot, "foot", (0, 2), MAX_PIXEL)
+    _bounded(target.face, "face", (0, 4), MAX_PIXEL)
     if target.face and min(target.face[2:]) < 0.0:
         raise Rejected(RejectionReason.OUT_OF_RANGE, "a face has a negative side")
     _one_of(target.view, "view", _VIEWS)
@@ -423,8 +434,7 @@ def _agent_status(message: pb.AgentStatus) -> None:
     _text(message.message, "message")
     _text(message.version, "version", MAX_LABEL)
     for numbers in (message.counters, message.gauges):
-        if len(numbers) > MAX_NUMBERS:
-            raise Rejected(RejectionReason.TOO_MANY, f"{len(numbers)} numbers, at most {MAX_NUMBERS}")
+        _count(numbers, "numbers", MAX_NUMBERS)
         for name, value in numbers.items():
             _text(name, "a number's name", MAX_LABEL)
             _number(value, "a counter or gauge")
@@ -436,26 +446,20 @@ MAX_INFORMATION = 1e30
 
 def _node_edge(edge: pb.NodeEdge) -> None:
     _name(edge.neighbour, "neighbour")
-    for values, name, length, most in (
-        (edge.rotation, "rotation", 3, MAX_TURN),
-        (edge.centre, "centre", 3, MAX_LENGTH),
-        (edge.hessian, "hessian", 21, MAX_INFORMATION),
-        (edge.gradient, "gradient", 6, MAX_INFORMATION),
-    ):
-        _bounded(values, name, (length,), most)
+    _bounded(edge.rotation, "rotation", (3,), MAX_TURN)
+    _bounded(edge.centre, "centre", (3,), MAX_LENGTH)
+    _bounded(edge.hessian, "hessian", (21,), MAX_INFORMATION)
+    _bounded(edge.gradient, "gradient", (6,), MAX_INFORMATION)
     _number(edge.count, "count", 0.0, MAX_COUNT)
     _number(edge.chi2, "chi2", 0.0, MAX_INFORMATION)
 
 
 def _node_anchor(anchor: pb.NodeAnchor) -> None:
     _name(anchor.camera, "anchor")
-    for values, name, lengths, most in (
-        (anchor.rotation, "rotation", (3,), MAX_TURN),
-        (anchor.position, "position", (3,), MAX_LENGTH),
-        (anchor.world_rotation, "world_rotation", (0, 3), MAX_TURN),
-        (anchor.world_position, "world_position", (0, 3), MAX_LENGTH),
-    ):
-        _bounded(values, name, lengths, most)
+    _bounded(anchor.rotation, "rotation", (3,), MAX_TURN)
+    _bounded(anchor.position, "position", (3,), MAX_LENGTH)
+    _bounded(anchor.world_rotation, "world_rotation", (0, 3), MAX_TURN)
+    _bounded(anchor.world_position, "world_position", (0, 3), MAX_LENGTH)
     _stds([anchor.rotation_std], "rotation_std", (1,), MAX_TURN)
     _stds([anchor.position_std], "position_std", (1,), MAX_LENGTH)
 
@@ -498,20 +502,21 @@ MAX_PICTURE = 512 * 1024  # bytes of a thumbnail
 
 
 def _command(message: pb.Command) -> None:
-    _name(message.sender, "sender")
-    _id(message.boot_id, "boot id")
+    check_names(message.sender, message.boot_id, "sender")
     _one_of(message.action, "action", ACTIONS)
     _name(message.agent, "agent")
     _id(message.agent_boot, "agent boot")
 
 
 def _picture(message: pb.Picture) -> None:
-    _name(message.camera, "camera")
-    _id(message.boot_id, "boot id")
+    check_names(message.camera, message.boot_id)
+    _image(message, MAX_PICTURE)
+
+
+def _image(message: Any, most_bytes: int) -> None:
     _times(message, "device_time_ns")
-    _number(message.width, "width", 1, MAX_IMAGE_SIDE)
-    _number(message.height, "height", 1, MAX_IMAGE_SIDE)
-    _count(message.jpeg, "bytes of picture", MAX_PICTURE)
+    _size(message)
+    _count(message.jpeg, "bytes of picture", most_bytes)
 
 
 MAX_IMAGE = 1_000_000
@@ -520,12 +525,6 @@ MAX_POINTS = 4096  # of one polyline
 MAX_FAR_PIXEL = 1e7  # far outside every image
 MAX_METRES = 1e7  # beyond any scene on the ground
 _TARGET_STATES = frozenset({"visible", "coasting", "lost"})
-
-
-def _uav_header(message: Any) -> None:
-    """The fields that all messages of a UAV agent have."""
-    _name(message.agent, "agent")
-    _id(message.boot_id, "boot id")
 
 
 def _points(values: Sequence[float], name: str, most: float) -> None:
@@ -538,12 +537,6 @@ def _points(values: Sequence[float], name: str, most: float) -> None:
         _number(value, name, -most, most)
 
 
-def _bounded(values: Sequence[float], name: str, lengths: tuple[int, ...], most: float) -> None:
-    _vector(values, name, lengths)
-    for value in values:
-        _number(value, name, -most, most)
-
-
 def _geodetic(geo: Sequence[float], name: str) -> None:
     """Latitude, longitude, altitude, or nothing."""
     _vector(geo, name, (0, 3))
@@ -552,15 +545,12 @@ def _geodetic(geo: Sequence[float], name: str) -> None:
 
 
 def _flight_image(message: pb.FlightImage) -> None:
-    _uav_header(message)
-    _times(message, "device_time_ns")
-    _number(message.width, "width", 1, MAX_IMAGE_SIDE)
-    _number(message.height, "height", 1, MAX_IMAGE_SIDE)
-    _count(message.jpeg, "bytes of picture", MAX_IMAGE)
+    check_names(message.agent, message.boot_id, "agent")
+    _image(message, MAX_IMAGE)
 
 
 def _vehicle_telemetry(message: pb.VehicleTelemetry) -> None:
-    _uav_header(message)
+    check_names(message.agent, message.boot_id, "agent")
     _times(message, "device_time_ns", "vehicle_time_ns")
     _number(message.time_std_s, "time_std_s", 0.0, MAX_TIME_S)
     _vector(message.ned_from_body, "ned_from_body", (4,))
@@ -571,7 +561,7 @@ def _vehicle_telemetry(message: pb.VehicleTelemetry) -> None:
 
 
 def _target_command(message: pb.TargetCommand) -> None:
-    _uav_header(message)
+    check_names(message.agent, message.boot_id, "agent")
     _one_of(message.kind, "kind", frozenset({"select", "stop"}))
     _bounded(message.box, "box", (4,) if message.kind == "select" else (0,), MAX_PIXEL)
     if message.box and not (message.box[2] > 0.0 and message.box[3] > 0.0):
@@ -580,7 +570,7 @@ def _target_command(message: pb.TargetCommand) -> None:
 
 
 def _target_state(message: pb.TargetState) -> None:
-    _uav_header(message)
+    check_names(message.agent, message.boot_id, "agent")
     _times(message, "device_time_ns")
     _one_of(message.state, "state", _TARGET_STATES)
     _bounded(message.centre, "centre", (0,) if message.state == "lost" else (2,), MAX_FAR_PIXEL)
@@ -598,12 +588,12 @@ def _target_state(message: pb.TargetState) -> None:
 
 
 def _target_cloud(message: pb.TargetCloud) -> None:
-    _uav_header(message)
+    check_names(message.agent, message.boot_id, "agent")
     _points(message.pixels, "pixels", MAX_FAR_PIXEL)
 
 
 def _road_map(message: pb.RoadMap) -> None:
-    _uav_header(message)
+    check_names(message.agent, message.boot_id, "agent")
     _points(message.pixels, "pixels", MAX_FAR_PIXEL)
     _points(message.ground, "ground", MAX_METRES)
     if message.ground and len(message.ground) != len(message.pixels):
@@ -611,11 +601,8 @@ def _road_map(message: pb.RoadMap) -> None:
 
 
 def _uav_info(message: pb.UavInfo) -> None:
-    _uav_header(message)
-    _number(message.width, "width", 1, MAX_IMAGE_SIDE)
-    _number(message.height, "height", 1, MAX_IMAGE_SIDE)
-    _number(message.fps, "fps", 0.0, MAX_FPS)
-    _intrinsics(message)
+    check_names(message.agent, message.boot_id, "agent")
+    _lens(message)
     _bounded(message.body_from_camera, "body_from_camera", (0, 9), 1.001)
     _text(message.model, "model", MAX_LABEL)
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deploy.evaluation.tracking_scores import GroundTruth, ScoredTrack, score_tracks
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.tracking.live_tracking import LiveTracking
 from hub.tracking.offline import follow
 from protocols.core.clocks import NANOSECONDS, TimeMap

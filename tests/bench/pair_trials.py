@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from hub.two_view.relative_pose import RelativePose, fundamental_from, orthogonal_axes, relative_pose_between
 from protocols.geometry import so3

@@ -21,7 +21,7 @@ from deploy.evaluation.clear_mot import EvaluationFrame, MotScores, clear_mot
 from edge import scenes
 from edge.agents.camera import PredictionSubscriber
 from edge.scenes import renderer_for
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from edge.scenes.people.scene import PeopleScene
 from hub.calibration.pipeline import calibrate
 from hub.tracking.calibration.people import PeopleTracklets

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.demo.flight_outcome import compare_log_with_world
-from deploy.demo.flight_report import write_report
+from deploy.demo.flight_outcome import compare_log_with_world, write_report
 from deploy.logs.replay_uav import replay_through_uav
 from edge.agents.uav import TOPICS
 from edge.devices.simulated.aircraft import Disturbance

@@ -11,8 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deploy.offline.track import TrackedFrame
-from deploy.offline.track_overlay import draw
+from deploy.offline.track import TrackedFrame, draw
 from edge.uav import tracker_factory
 from protocols.geometry.types import Image
 from tests.support.oblique.world import ObliqueWorld

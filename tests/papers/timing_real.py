@@ -31,8 +31,7 @@ from hub.baselines.alternating_lag import (
 )
 from hub.sync.pair_solver import solve_pair
 from hub.trajectory.image_tracks import SmoothTrack, smooth_track
-from hub.two_view.fundamental import epipolar_lines, line_distances
-from hub.two_view.relative_pose import fundamental_from, relative_pose_between
+from hub.two_view.relative_pose import epipolar_lines, fundamental_from, line_distances, relative_pose_between
 from protocols.core.errors import Refused
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats

@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hub.baselines.alternating_lag import estimate_alternately
-from hub.two_view.fundamental import epipolar_lines, line_distances, maximum_likelihood_fundamental
+from hub.two_view.relative_pose import epipolar_lines, line_distances, maximum_likelihood_fundamental
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.geometry.types import Floats

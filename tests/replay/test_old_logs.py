@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from protocols.core.errors import InputError
-from protocols.log.read import migration
+from protocols.log import layout
 from protocols.log.read.reader import LogReader
 from protocols.log.write import writer
 from protocols.log.write.writer import LogWriter
@@ -58,7 +58,7 @@ def test_old_messages_are_brought_up_to_date_step_by_step(tmp_path: Path, monkey
     with LogWriter(tmp_path / "a.mcap") as log:
         log.write(TRACK, "hub", "yard", track(), 5)
 
-    def step(addition: str) -> migration.Upgrade:
+    def step(addition: str) -> layout.Upgrade:
         def upgrade(topic: Topic, payload: bytes) -> bytes:
             assert topic is TRACK
             message = pb.Track.FromString(payload)
@@ -67,13 +67,13 @@ def test_old_messages_are_brought_up_to_date_step_by_step(tmp_path: Path, monkey
 
         return upgrade
 
-    monkeypatch.setattr(migration, "UPGRADES", {1: step("-two"), 2: step("-three")})
-    monkeypatch.setattr(migration, "SCHEMA_VERSION", 3)
+    monkeypatch.setattr(layout, "UPGRADES", {1: step("-two"), 2: step("-three")})
+    monkeypatch.setattr(layout, "SCHEMA_VERSION", 3)
     (item,) = LogReader(tmp_path / "a.mcap").messages()
     assert item.message.label == "marker-two-three"  # type: ignore[attr-defined]
 
 
 def test_every_step_from_every_version_is_there() -> None:
-    assert set(migration.UPGRADES) == set(range(1, SCHEMA_VERSION))
+    assert set(layout.UPGRADES) == set(range(1, SCHEMA_VERSION))
     with pytest.raises(InputError, match="update Syncline"):
-        migration.upgrades_for(Path("a.mcap"), {"schema": str(SCHEMA_VERSION + 1)})
+        layout.upgrades_for(Path("a.mcap"), {"schema": str(SCHEMA_VERSION + 1)})

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.clocks.external_prior import ExternalClockPrior
 from protocols.core.clocks import TimeMap
 from protocols.geometry.pose import Pose

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.trajectory.image_tracks import SmoothTrack, smooth_track
 from protocols.core.clocks import CameraTime, ReferenceTime, TimeMap
 from protocols.geometry import so3

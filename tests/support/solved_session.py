@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
+from protocols.core.acceptance import PairReport
 from protocols.core.clocks import TimeMap
-from protocols.core.pair_report import PairReport
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, CameraCalibration, TrajectoryTable

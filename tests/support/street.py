@@ -12,9 +12,8 @@ import numpy as np
 
 from edge import scenes
 from edge.devices.playback.video_reader import VideoReader
-from edge.scenes.common.base import SimulatedCamera
-from edge.scenes.common.placement import look_at_pose
-from edge.scenes.common.sensor import pixel_rays
+from edge.scenes.common.background import pixel_rays
+from edge.scenes.common.base import SimulatedCamera, look_at_pose
 from edge.scenes.people.renderer import PeopleRenderer
 from edge.scenes.people.scene import PeopleScene
 from edge.scenes.people.walking import WalkingPaths

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import Rig

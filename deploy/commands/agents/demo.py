@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from deploy.commands.common import Flag, Json, check_range, check_seed
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED
@@ -56,48 +56,34 @@ def demo(
     check_range("--cameras", cameras, 2, 20)
     check_range("--seconds", seconds, 5.0, 3600.0)
     check_range("--view-port", view_port, 0, 65535)
-    if scene == "town":
-        return _town(out, seconds, seed, view_port if view else None, as_json=json)
     from deploy.demo.display import ProgressDisplay
     from deploy.demo.marker import DemoProcesses, DemoSettings
 
+    outcome: Any
+    shown = ProgressDisplay("tracking" if scene == "town" else "filming", seconds, quiet=json)
     settings = DemoSettings(scene, seed, cameras, seconds, out, view_port if view else None)
-    if scene == "people":
+    if scene == "town":
+        from deploy.demo.flight import run_town
+
+        with shown as display:
+            outcome = run_town(out, seconds, seed, display, settings.view_port)
+    elif scene == "people":
         from deploy.demo.people import PeopleDemoProcesses, compare_with_people
 
         people = PeopleDemoProcesses(settings)
-        with ProgressDisplay("filming", seconds, quiet=json) as display:
+        with shown as display:
             people.run(display)
-        followed = compare_with_people(out, seed, cameras)
-        if json:
-            print(followed.as_json())
-        else:
-            followed.print(out)
-        return EXIT_DONE if followed.good else EXIT_REFUSED
-    from deploy.evaluation.ground_truth import compare_with_truth
+        outcome = compare_with_people(out, seed, cameras)
+    else:
+        from deploy.evaluation.ground_truth import compare_with_truth
 
-    fleet = DemoProcesses(settings)
-    with ProgressDisplay("filming", seconds, quiet=json) as display:
-        live = fleet.run(display)
-    fleet.check_calibrated()
-    comparison = compare_with_truth(out, scene, seed, cameras)
+        fleet = DemoProcesses(settings)
+        with shown as display:
+            live = fleet.run(display)
+        fleet.check_calibrated()
+        outcome = compare_with_truth(out, scene, seed, cameras, live.first_calibration_s)
     if json:
-        print(comparison.as_json(live.first_calibration_s))
+        print(outcome.as_json())
     else:
-        comparison.print(live.first_calibration_s, out)
-    return EXIT_DONE if comparison.good else EXIT_REFUSED
-
-
-def _town(out: Path, seconds: float, seed: int, view_port: int | None, *, as_json: bool) -> int:
-    from deploy.demo.display import ProgressDisplay
-    from deploy.demo.flight import run_town
-    from deploy.demo.flight_outcome import as_json as to_json
-    from deploy.demo.flight_outcome import print_outcome
-
-    with ProgressDisplay("tracking", seconds, quiet=as_json) as display:
-        outcome = run_town(out, seconds, seed, display, view_port)
-    if as_json:
-        print(to_json(outcome))
-    else:
-        print_outcome(outcome, out)
+        outcome.print(out)
     return EXIT_DONE if outcome.good else EXIT_REFUSED

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-import shlex
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deploy.commands.common import Flag, Json, NumberList, answer, check_range, check_seed, parse_box
+from deploy.commands.common import Flag, Json, NumberList, answer, check_range, check_seed, command_line, parse_box
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 
 if TYPE_CHECKING:
@@ -114,7 +112,7 @@ def quick(
     assumed = ", ".join(run.lens_assumed)
     text = f"a field of view of {field_of_view:g} degrees is assumed for {assumed}: poses are approximate"
     warnings = (text,) if assumed else ()
-    command = shlex.join(["syncline", *sys.argv[1:]])
+    command = command_line()
     cpu = time.process_time() - began
     if hub.refusal is not None or hub.calibration is None:
         refusal = hub.refusal or Refused(hub.missing() or "nothing was seen")

@@ -40,9 +40,8 @@ def router(config: Path, /, *, print_config: PrintConfig = False) -> int:
     if print_config:
         print(effective_toml(settings), end="")
         return EXIT_DONE
-    from deploy.agents.conditions import Conditions
     from deploy.agents.health import Health
-    from deploy.agents.startup_checks import check_startup, serve_health
+    from deploy.agents.startup_checks import Conditions, check_startup, serve_health
     from protocols.bus.base import BusDead
     from protocols.bus.router.zenoh_router import RulesChanged, run_router
 

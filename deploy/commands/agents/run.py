@@ -97,10 +97,9 @@ def _with_bus(settings: Any, start: Any) -> int:
 
     If the bus fails, the process ends with one line and status 1, so that its supervisor restarts it.
     """
-    from deploy.agents.conditions import Conditions
     from deploy.agents.health import Health
     from deploy.agents.malloc_tuning import limit_heap_growth
-    from deploy.agents.startup_checks import check_startup, role_of, serve_health
+    from deploy.agents.startup_checks import Conditions, check_startup, role_of, serve_health
     from deploy.agents.systemd_notify import Notifier
     from protocols.bus.base import BusDead, BusStopped
     from protocols.bus.security.sender_identity import SenderCheckedBus

@@ -59,7 +59,7 @@ def export(
     """
     from deploy.offline.exchange import exports
     from protocols.core.files import check_folder, write_together
-    from protocols.formats.trc import trc_text, write_c3d
+    from protocols.formats.trajectories import trc_text, write_c3d
     from protocols.log.read.session import is_log
 
     log = is_log(source)

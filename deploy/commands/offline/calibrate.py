@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-import shlex
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from deploy.agents.malloc_tuning import retain_freed_memory
-from deploy.commands.common import Flag, Json, Scheduler, check_seed
+from deploy.commands.common import Flag, Json, Scheduler, check_seed, command_line
 from deploy.offline.progress import progress_bar
 from hub.api import read_session
 from protocols.core.errors import EXIT_DONE, InputError, Refused
@@ -96,7 +94,7 @@ def calibrate(
     options = CalibrationOptions(solver, from_known, seed=seed, refine_lenses=refine_lenses)
     read = _load(session, observations, out, marker, detector, json)
     read = _with_scale(read, height, limb)
-    command = shlex.join(["syncline", *sys.argv[1:]])
+    command = command_line()
     defer_modules("numpy", UNUSED_OF_NUMPY)
     from deploy.offline.outputs import report_refusal, report_result
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import resource
-import shlex
-import sys
 from pathlib import Path
 from typing import Literal
 
-from deploy.commands.common import Json, NumberList, Scheduler, answer, check_range, closing_lines
+from deploy.commands.common import Json, NumberList, Scheduler, answer, check_range, closing_lines, command_line
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import check_folder, write_together
@@ -141,7 +139,7 @@ def follow(
         units_per_m = 1.0 / METRES_PER_UNIT[known.calibration.units]
         given = read_ground_truth(truth, source.frame_times(known))
         scores = score_tracks(given, result.tracks, times, units_per_m, limits)
-    command = shlex.join(["syncline", *sys.argv[1:]])
+    command = command_line()
     written = [out / name for name in (TRACKS, RESULT, REPORT)]
     if crops is not None:
         with progress_bar("cutting out heads and torsos", quiet=json) as progress:
@@ -172,12 +170,9 @@ def follow(
         used = f"{100 * camera.used:.0f} % used"
         lines.append(f"{name}: {camera.frames} frames, {camera.detections} detections, {used}")
     if scores is not None:
-        lines.append(", ".join(f"{name.upper()} {_shown(scores[name])}" for name in ("moda", "mota", "idf1", "hota")))
+        values = {name.upper(): scores[name] for name in ("moda", "mota", "idf1", "hota")}
+        lines.append(", ".join(f"{name} {'-' if value is None else f'{value:.3f}'}" for name, value in values.items()))
     return answer(document, [*lines, *closing_lines(warnings, written)], json)
-
-
-def _shown(value: float | int | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
 
 
 def _cpu_seconds() -> float:

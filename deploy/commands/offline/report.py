@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from pathlib import Path
 
-from deploy.commands.common import Flag, Json, UnusedSeed, answer, closing_lines, open_browser
+from deploy.commands.common import Flag, Json, UnusedSeed, answer, closing_lines, command_line, open_browser
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 
 
@@ -54,7 +52,7 @@ def report(
         raise InputError("a report is an .html file", file=file, remedy="choose another --out")
     with progress_bar(f"solving {source.name}", quiet=json) as progress:
         report_input = load_report_input(source, session, progress)
-    command = report_input.command or shlex.join(["syncline", *sys.argv[1:]])
+    command = report_input.command or command_line()
     outcome = report_input.outcome
     write_atomically(
         file, build_report(outcome, report_input.rig, report_input.observations, command, report_input.history)

@@ -97,7 +97,6 @@ def track(
     from deploy.evaluation.track_scores import read_truth, score
     from deploy.offline import track as tracking
     from deploy.offline.track_log import LoggedFlightImages, open_recording
-    from deploy.offline.track_overlay import draw
     from edge.devices.playback.video_writer import video_writer
     from edge.uav import tracker_factory
 
@@ -143,7 +142,7 @@ def track(
             start=start,
             telemetry=samples,
             georeference=georeference,
-            show=None if write is None else lambda image, tracked: write(draw(image, tracked)),
+            show=None if write is None else lambda image, tracked: write(tracking.draw(image, tracked)),
             progress=frame_done,
         ):
             # Particles and layers are only for the overlay, and would fill the memory for a long video.
@@ -205,7 +204,7 @@ def _samples(
     """The telemetry's samples, warnings, and what corrects positions by them where they are surely on the video's
     clock. Raises InputError."""
     from deploy.offline import track as tracking
-    from deploy.offline.telemetry_files import align_to_video, check_attitudes, read_telemetry_log
+    from deploy.offline.telemetry_files import Footage, align_to_video, check_attitudes, read_telemetry_log
     from deploy.offline.track_log import LoggedFlightImages
     from edge.uav.georeference import Georeference
 
@@ -232,8 +231,8 @@ def _samples(
         gaps = tracking.check_clock(samples, telemetry, *span)
         if flight.lens is not None and flight.mounting is not None:
             with _watched("comparing the telemetry with", flight, quiet) as done:
-                given = flight.video, flight.rate, flight.lens, flight.mounting
-                samples, found, aligned = check_attitudes(recorded, telemetry, *given, done)
+                footage = Footage(flight.video, flight.rate, flight.lens, flight.mounting, done)
+                samples, found, aligned = check_attitudes(recorded, telemetry, footage)
             if aligned:
                 gaps = tracking.check_clock(samples, telemetry, *span)
             warnings += found
@@ -246,8 +245,8 @@ def _samples(
         samples = ()
     else:
         with _watched("looking for the telemetry's clock in", flight, quiet) as done:
-            given = flight.video, flight.rate, flight.lens, flight.mounting
-            samples, found = align_to_video(recorded, telemetry, *given, done)
+            footage = Footage(flight.video, flight.rate, flight.lens, flight.mounting, done)
+            samples, found = align_to_video(recorded, telemetry, footage)
         warnings += found
         aligned = True
     if not aligned or flight.lens is None or flight.mounting is None:

@@ -82,7 +82,7 @@ def _save(result: TriangulationResult, out: Path) -> None:
     from tempfile import TemporaryDirectory
 
     from protocols.core.files import write_atomically
-    from protocols.formats.trc import trc_text, write_c3d
+    from protocols.formats.trajectories import trc_text, write_c3d
 
     suffix = out.suffix.lower()
     if suffix not in (".trc", ".c3d"):

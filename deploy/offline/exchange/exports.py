@@ -6,7 +6,7 @@ from pathlib import Path
 
 from protocols.core.errors import InputError
 from protocols.core.files import file_in
-from protocols.formats import caliscope, colmap, opensfm, toml_rigs, xml_export, yaml_rigs
+from protocols.formats import colmap, opensfm, toml_rigs, trajectories, xml_rigs, yaml_rigs
 from protocols.formats.cameras import ExportedFiles, convert_units
 from protocols.session.calibration import read_calibration
 from protocols.session.rig import METRES_PER_UNIT
@@ -28,8 +28,8 @@ def calibration_files(source: Path, to: str, out: Path) -> tuple[dict[Path, str]
         written = yaml_rigs.write_opencv(cameras, rig.units)
     elif to == "ros":
         written = yaml_rigs.write_ros(cameras)
-    elif to in xml_export.UNITS:
-        written = xml_export.write(to, cameras, rig.units, scale, out.name)
+    elif to in xml_rigs.UNITS:
+        written = xml_rigs.write(to, cameras, rig.units, scale, out.name)
     else:  # their files state no units, and are read as metres
         metric, warnings = convert_units(cameras, rig.units, "m", scale)
         if to == "kalibr":
@@ -52,7 +52,7 @@ def caliscope_volume(source: Path, session: Path, out: Path) -> tuple[dict[Path,
     rig, cameras = read_calibration(source)
     found = triangulate(session, source)
     metric = rig.metadata.get("scale", "metric") != "arbitrary"
-    tables, note = caliscope.point_tables(
+    tables, note = trajectories.point_tables(
         found.observations,
         {name: camera.time_map for name, camera in cameras.items() if name not in found.unused},
         toml_rigs.caliscope_numbers(cameras)[0],

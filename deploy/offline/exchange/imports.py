@@ -23,7 +23,7 @@ from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import parse_camera_table
 
 _TABLES = ("aniposelib", "caliscope", "pose2sim", "freemocap", "opencv", "kalibr", "colmap", "opensfm")
-CALIBRATIONS = (*_TABLES, *xml_rigs.FORMATS)
+CALIBRATIONS = (*_TABLES, *xml_rigs.UNITS)
 POINTS = ("caliscope-points", "deeplabcut", "mvus", *keypoints.FORMATS)
 FORMATS = (*CALIBRATIONS, *POINTS, "session")
 _CROWDED_SHARE = 0.1  # of the frames with more than one person: above it, they are different labels
@@ -99,7 +99,7 @@ def read_foreign_calibration(source: ImportSource) -> ForeignRig:
         return colmap.read(file)
     if source.kind == "kalibr":
         return yaml_rigs.read_kalibr(file)
-    if source.kind in xml_rigs.FORMATS:
+    if source.kind in xml_rigs.UNITS:
         return xml_rigs.read(file, source.kind)
     if source.kind == "opensfm":
         return opensfm.read(file)

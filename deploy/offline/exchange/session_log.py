@@ -146,8 +146,6 @@ def rig_tables_of_log(rig: Rig) -> dict[str, Any]:
         metadata["up"] = rig.up if isinstance(rig.up, str) else rig.up.tolist()
     tables: dict[str, Any] = {"metadata": metadata}
     for name, camera in rig.cameras.items():
-        from protocols.geometry import so3
-
         table: dict[str, Any] = {"name": name, "size": list(camera.size)}
         if camera.fps:
             table["fps"] = camera.fps
@@ -155,38 +153,21 @@ def rig_tables_of_log(rig: Rig) -> dict[str, Any]:
             table["readout"] = camera.readout
         if camera.focal_std:
             table["focal_std"] = camera.focal_std
-        lens = camera.intrinsics
-        if lens is not None:
-            table |= lens.table()
-        if camera.rotation is not None:
-            table["rotation"] = so3.log(camera.rotation).tolist()
-        for key in ("position", "position_std", "rotation_std"):
-            value = getattr(camera, key)
-            if value is not None:
-                table[key] = value.tolist()
-        tables[name] = table
+        lens = {} if camera.intrinsics is None else camera.intrinsics.table()
+        tables[name] = table | lens | camera.pose_table()
     return tables
 
 
 def camera_info(rig: Rig, name: str) -> pb.CameraInfo:
     """The information message of a rig's camera."""
-    from protocols.geometry import so3
-
     camera = rig.cameras[name]
-    info = pb.CameraInfo(schema_version=SCHEMA_VERSION, camera=name, boot_id="import", driver="import", clock="device")
+    known = camera.pose_table() | ({} if camera.intrinsics is None else camera.intrinsics.message_fields())
+    info = pb.CameraInfo(
+        schema_version=SCHEMA_VERSION, camera=name, boot_id="import", driver="import", clock="device", **known
+    )
     info.target = str(rig.metadata.get("target", ""))
     info.width, info.height, info.fps = camera.size[0], camera.size[1], camera.fps
     info.readout_s, info.focal_std = camera.readout or 0.0, camera.focal_std
-    if camera.intrinsics is not None:
-        info.matrix.extend(camera.intrinsics.matrix.ravel().tolist())
-        info.distortions.extend(camera.intrinsics.distortions.tolist())
-        info.fisheye = camera.intrinsics.fisheye
-    for key in ("position", "position_std", "rotation_std"):
-        value = getattr(camera, key)
-        if value is not None:
-            getattr(info, key).extend(value.tolist())
-    if camera.rotation is not None:
-        info.rotation.extend(so3.log(camera.rotation).tolist())
     return info
 
 

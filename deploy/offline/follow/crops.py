@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from deploy.offline.progress import Progress
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.kalman import POSITION
 from hub.tracking.messages import face_regions, head_views
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from deploy.offline.follow.source import FollowInput
     from hub.tracking.offline import FollowedTrack
 
-Progress = Callable[[str, float], None]
 _HEAD_MARGIN = 1.3
 """Sides of the head's picture over those of the region of head and face: hair, and a few per cent of error in the
 height of a detection."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from deploy.offline.follow.objects import (
     read_objects,
 )
 from deploy.offline.follow.units import check_units
+from deploy.offline.progress import Progress
 from hub.tracking.detections import TrackingCamera
 from hub.trajectory.image_tracks import MAX_PAUSE_S
 from protocols.core.clocks import NANOSECONDS
@@ -30,7 +31,6 @@ from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.rig import read_rig
 from protocols.topics import OBSERVATION
 
-Progress = Callable[[str, float], None]
 LOG_OF_VIDEOS = "detections.mcap"
 _SAME_TIME_NS = NANOSECONDS
 """Cameras at 1 Hz need not have their frames at one time."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from deploy.offline.exchange.session_log import camera_info, write_observation_log
 from deploy.offline.follow.objects import Kind
+from deploy.offline.progress import Progress
 from deploy.offline.video_folder import VideoFile, list_videos
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from edge.detectors.base import Detection, Detector
     from edge.devices.playback.video_reader import VideoReader
 
-Progress = Callable[[str, float], None]
 _POLL_S = 0.2  # s: between two looks at the workers
 _shares: Any = None  # in a worker process: the share of each video that is done
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from deploy.site.doctor import agent as agents
-from deploy.site.doctor import autopilot, machine, network
+from deploy.site.doctor import autopilot, machine
 from deploy.site.doctor.check_result import CheckResult, skip, unavailable
 from deploy.site.install import units
 from deploy.site.rig_folder import role_of
@@ -44,7 +44,7 @@ def run_checks(file: Path | None, role: str | None = None) -> Iterator[CheckResu
     yield from _one("agents", lambda: agents.others(config.bus, config.site, kind))
     if kind == "uav":
         yield from _all("mavlink", lambda: autopilot.check(config))
-    yield from _one("health", lambda: network.running_agent(config))
+    yield from _one("health", lambda: agents.running_agent(config))
     yield from _one("last crash", lambda: machine.crash(f"syncline-{kind}-{config.id}.service"))
 
 
@@ -56,7 +56,7 @@ def _all(name: str, checks: Callable[[], Iterator[CheckResult]]) -> Iterator[Che
     try:
         yield from checks()
     except (OSError, InputError) as error:
-        yield network.guarded(name, error)
+        yield agents.guarded(name, error)
 
 
 def role_from_path(file: Path) -> str:

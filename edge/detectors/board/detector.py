@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.board.description import Board
-from edge.detectors.board.finder import NOTHING, Corners, Finder, Grey
-from edge.detectors.board.saddles import linked_saddles
+from edge.detectors.board.finder import NOTHING, Corners, Finder, Grey, linked_saddles
 from protocols.geometry.types import Floats
 
 SEARCH_PX = 1280

@@ -18,8 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.moving.bootstrap import BackgroundBootstrap, background_mode
-from edge.detectors.moving.ghosts import GHOST_STEP, Box, remove_ghosts, slices, uncovered_background
-from edge.detectors.moving.shadows import ShadowDetector
+from edge.detectors.moving.shadows import GHOST_STEP, Box, ShadowDetector, remove_ghosts, slices, uncovered_background
 from protocols.geometry.types import Bools, Floats, Image
 
 SubtractorName = Literal["mog2", "knn"]

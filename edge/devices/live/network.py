@@ -54,20 +54,18 @@ class NetworkCamera(ReconnectingCamera):
         transport: Literal["tcp", "udp"] = "tcp",
         fps: float | None = None,
         intrinsics: Intrinsics | None = None,
-        now_ns: Callable[[], int] = time.monotonic_ns,
-        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         name = f"camera {redact_password(url)}"
 
         def connect() -> Connection:
-            return NetworkConnection(url, transport, fps, name, now_ns)
+            return NetworkConnection(url, transport, fps, name, time.monotonic_ns)
 
         def describe(connection: NetworkConnection, width: int, height: int) -> DeviceInfo:
             late = "time of capture: late by the camera's own delay"
             unknown = ("exposure", late if connection.stamped else "time of capture: stamped on arrival")
             return DeviceInfo(width, height, connection.fps, "rtsp", "monotonic", unknown=unknown)
 
-        super().__init__(name, connect, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connect, describe, intrinsics, remedy=_REMEDY)
 
 
 class NetworkConnection:

@@ -73,7 +73,7 @@ class OakCamera(ReconnectingCamera):
     Stamps are in the host's CLOCK_MONOTONIC, to which depthai maps the board's clock: unlike the board's own clock it
     continues when the board is plugged in again.
     prefix: of the labels of people and vehicles. connect: opens the stream; tests pass a host-only pipeline.
-    now_ns: a monotonic clock; sleep: used between reconnection attempts.
+    now_ns: a monotonic clock.
     """
 
     def __init__(
@@ -84,7 +84,6 @@ class OakCamera(ReconnectingCamera):
         prefix: str = "oak",
         connect: Callable[[OakSettings], OakStream] | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
-        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         name = settings.device or "OAK camera"
         make = connect or open_stream
@@ -101,7 +100,7 @@ class OakCamera(ReconnectingCamera):
         def describe(connection: OakConnection, width: int, height: int) -> DeviceInfo:
             return DeviceInfo(width, height, settings.fps, "oak", "monotonic")
 
-        super().__init__(name, connected, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connected, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns)
 
 
 class OakConnection:

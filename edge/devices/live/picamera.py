@@ -7,7 +7,6 @@ earlier.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -32,8 +31,6 @@ class PiCamera(ReconnectingCamera):
         *,
         intrinsics: Intrinsics | None = None,
         make: Callable[[int], Any] | None = None,
-        now_ns: Callable[[], int] = time.monotonic_ns,
-        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         name = f"Pi camera {settings.camera}"
 
@@ -55,7 +52,7 @@ class PiCamera(ReconnectingCamera):
             readout_s = connection.readout_s
             return DeviceInfo(width, height, settings.fps, "picamera2", "monotonic", None, readout_s, unknown)
 
-        super().__init__(name, connect, describe, intrinsics, remedy=_REMEDY, now_ns=now_ns, sleep=sleep)
+        super().__init__(name, connect, describe, intrinsics, remedy=_REMEDY)
 
 
 class PiConnection:

@@ -16,11 +16,10 @@ from edge.devices.playback.base import Playback
 from edge.devices.playback.playback_clock import PlaybackClock
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
-from protocols.core.jpeg import decode_jpeg
+from protocols.core.jpeg import ThumbnailScale, decode_jpeg
 from protocols.geometry.camera import Intrinsics
 from protocols.log.read.images import ImageRun, image_runs, read_images
 from protocols.log.read.reader import LogReader
-from protocols.log.write.thumbnails import ThumbnailScale
 
 
 class LogPlayback(Playback):

@@ -11,8 +11,7 @@ from edge import scenes
 from edge.devices.base import DeviceInfo, Frame
 from edge.devices.playback.playback_clock import PlaybackClock, RealTime, wait_until
 from edge.scenes import renderer_for
-from edge.scenes.common.base import Renderer, SimulatedScene
-from edge.scenes.common.rescaling import rescale_scene
+from edge.scenes.common.base import Renderer, SimulatedScene, rescale_scene
 from protocols.core.clocks import NANOSECONDS
 
 _DAY_S = 86_400.0  # s

@@ -11,9 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from edge.scenes.common.background import LIGHT_WORLD
+from edge.scenes.common.background import (
+    LIGHT_WORLD,
+    PEDESTAL,
+    SensorNoise,
+    pixel_rays,
+    static_background,
+    subtract_pedestal,
+)
 from edge.scenes.common.base import Renderer
-from edge.scenes.common.sensor import PEDESTAL, SensorNoise, pixel_rays, static_background, subtract_pedestal
 from protocols.geometry.types import Floats
 
 if TYPE_CHECKING:

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edge.scenes.common.base import SimulatedScene, SimulatedTrack
-from edge.scenes.common.placement import MIXED_FPS, CameraPlacement, place_cameras
+from edge.scenes.common.base import MIXED_FPS, CameraPlacement, SimulatedScene, SimulatedTrack, place_cameras
 from protocols.geometry.types import Floats
 from protocols.session.observations import DEFAULT_LABEL
 

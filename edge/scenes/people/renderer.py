@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.scenes.common.background import LIGHT_WORLD
+from edge.scenes.common.background import LIGHT_WORLD, PEDESTAL, SensorNoise, static_background, subtract_pedestal
 from edge.scenes.common.base import Renderer
-from edge.scenes.common.sensor import PEDESTAL, SensorNoise, static_background, subtract_pedestal
 from edge.scenes.people.scene import RADII, Person, joint_radii
 from edge.scenes.people.walking import JOINTS
 from protocols.geometry.types import Floats, Image

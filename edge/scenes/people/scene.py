@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.scenes.common.base import SimulatedScene, SimulatedTrack
-from edge.scenes.common.placement import CameraPlacement, place_cameras
+from edge.scenes.common.base import CameraPlacement, SimulatedScene, SimulatedTrack, place_cameras
 from edge.scenes.people.walking import CROWN, WalkingPaths, body_joints, random_walks
 from protocols.geometry.types import Bools, Floats
 

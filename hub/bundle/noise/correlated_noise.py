@@ -17,19 +17,7 @@ from hub.bundle.gls import GlsSolution, is_tractable, solve_gls
 from hub.bundle.noise.gauss_markov import estimate_correlated_noise
 from hub.bundle.noise.noise_scale import correlation_inflation, estimate_noise
 from hub.bundle.normal_equations import camera_priors
-from hub.bundle.problem import (
-    ASPECT,
-    CAMERA_PARAMETERS,
-    CENTRE,
-    FOCAL,
-    K1,
-    K2,
-    K3,
-    P1,
-    AdjustmentState,
-    LensPrior,
-    Problem,
-)
+from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, Column, LensPrior, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry.camera import Intrinsics
@@ -41,7 +29,6 @@ lenses that were not measured any significant one counts: what a path absorbs of
 do not show, and weak directions of these lenses follow it against their priors."""
 _MAX_ROTATION_STD = 0.0175
 """Std [rad] of a camera's orientation above which correlated errors and trajectory cannot be distinguished."""
-_LENS = (FOCAL, CENTRE, CENTRE + 1, K1, K2, K3, ASPECT, P1, P1 + 1)
 
 
 def lens_tolerance(lens: Intrinsics) -> LensPrior:
@@ -129,7 +116,7 @@ def prefers_nominal_lenses(problem: Problem, best: GlsSolution) -> bool:
     terms = {
         column: (value, std)
         for column, value, std in camera_priors(problem, best.state)
-        if column % CAMERA_PARAMETERS in _LENS
+        if column % CAMERA_PARAMETERS in Column.LENS
         and not (problem.lens_priors and problem.lens_priors[column // CAMERA_PARAMETERS] is not None)
     }
     if not terms:

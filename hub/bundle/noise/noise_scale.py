@@ -21,8 +21,8 @@ from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
     CAMERA_PARAMETERS,
     LARGE_NETWORK,
-    OFFSET,
     AdjustmentState,
+    Column,
     FreeParameters,
     Problem,
     TrackObservations,
@@ -262,7 +262,7 @@ def score_inflation(problem: Problem, state: AdjustmentState, camera: int, min_p
     for rows in problem.of_camera(camera):
         if np.count_nonzero(rows.use) >= 8:
             seen = evaluate_residuals(rows, state.cameras[camera], state.trajectories[rows.label])
-            by_time = jacobians(seen, state.cameras[camera], [OFFSET])[:, 3]
+            by_time = jacobians(seen, state.cameras[camera], [Column.OFFSET])[:, 3]
             score = (seen.whitened(seen.residual) * by_time).sum(axis=0)
             parts.append((rows.stamps[rows.use][seen.valid], np.column_stack([score, score])[seen.valid]))
     frames = _within_frame_inflation(parts)

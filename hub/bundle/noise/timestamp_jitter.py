@@ -22,7 +22,7 @@ from hub.bundle.covariance import middles_of_overlap
 from hub.bundle.initialisation import SEEN_WITHIN_S
 from hub.bundle.noise.clock_wander import Wander, fit_wander
 from hub.bundle.normal_equations import CAUCHY_WIDTH
-from hub.bundle.problem import OFFSET, AdjustmentState, Problem, TrackObservations
+from hub.bundle.problem import AdjustmentState, Column, Problem, TrackObservations
 from hub.bundle.residuals import ResidualEvaluation, evaluate_residuals, jacobians
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry.types import Bools, Floats, Ints
@@ -230,7 +230,7 @@ def _velocity(rows: TrackObservations, state: AdjustmentState) -> tuple[Residual
     """Residuals of all rows, and their velocities (n, 2) [px/s]."""
     camera, every = state.cameras[rows.camera], rows.using(np.ones(len(rows.time), dtype=np.bool_))
     seen = evaluate_residuals(every, camera, state.trajectories[rows.label])
-    return seen, jacobians(seen, camera, [OFFSET])[:, 3].T * camera.rate
+    return seen, jacobians(seen, camera, [Column.OFFSET])[:, 3].T * camera.rate
 
 
 def _clock_parameters(problem: Problem, state: AdjustmentState, camera: int, stamp: Floats, height: Floats) -> Floats:

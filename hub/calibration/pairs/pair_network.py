@@ -26,10 +26,9 @@ from hub.clocks.clock_graph import connected_components
 from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior
 from hub.sync.common_clock import solve_common_clock_pair
 from hub.sync.hypothesis import PairFit, PairSolution, evidence
-from hub.sync.pair_ranking import ranking_score
 from hub.sync.pair_solver import FRAME_RATES, SLOW_MOTION_RATES, solve_pair
 from hub.sync.settings import PairSettings
-from hub.sync.track_cache import TrackCache
+from hub.sync.track_cache import TrackCache, ranking_score
 from hub.trajectory.image_tracks import smooth_only
 from hub.two_view.relative_pose import relative_pose_between
 from protocols.geometry.types import Floats

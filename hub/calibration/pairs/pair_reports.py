@@ -10,7 +10,7 @@ from hub.calibration.pairs.pair_network import coincide, pair_lag
 from hub.calibration.solvers import Solution
 from hub.sync.hypothesis import PairSolution
 from hub.two_view.relative_pose import fundamental_from, relative_pose_between
-from protocols.core.pair_report import PairReport
+from protocols.core.acceptance import PairReport
 from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration
 

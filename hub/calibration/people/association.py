@@ -18,8 +18,7 @@ import numpy as np
 from hub.bundle.preprocessing import PreparedSession, nominal_intrinsics, prepare
 from hub.calibration.pairs.pair_network import Progress, solve_one_pair
 from hub.calibration.people.tracklets import Tracklet, find_tracklets, people_of
-from hub.sync.pair_ranking import ranking_score
-from hub.sync.track_cache import TrackCache
+from hub.sync.track_cache import TrackCache, ranking_score
 from hub.trajectory.image_tracks import smooth_only
 from hub.two_view.relative_pose import relative_pose_between, sampson
 from protocols.core.clocks import CameraTime

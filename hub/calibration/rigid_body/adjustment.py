@@ -1,21 +1,26 @@
-"""Bundle adjustment of cameras around moving rigid bodies of known geometry.
+"""Bundle adjustment of cameras around moving rigid bodies of known geometry, and the covariances of its estimates.
 
 Levenberg-Marquardt on the reprojection error of the bodies' points, each view at its own time: the body moves on a
 spline of its pose (one pose an instant on a shared clock). Where clocks are independent, every view may have a time
 error of its own, with a prior whose std is estimated from the data: webcams stamp frames when they are read. These
 time errors are eliminated first, the bodies' poses next (a banded system), the cameras last.
+
+Errors of the corners of one view are correlated (a bent board, a lens that is not exactly known), and those of
+neighbouring views too. Where the scatter of the views' gradients, summed over clusters of views, is larger than what
+independent rows would give, the stds are enlarged to it (the sandwich estimator: White, "Maximum likelihood estimation
+of misspecified models", 1982).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solveh_banded
+from scipy.linalg import cho_factor, cho_solve, solveh_banded
 
 from hub.bundle.adjustment import apply_camera_step
 from hub.bundle.bordered_system import third_differences
-from hub.bundle.problem import CAMERA_PARAMETERS
+from hub.bundle.problem import CAMERA_PARAMETERS, Column
 from hub.calibration.rigid_body.linear_system import (
     BLOCK,
     CAUCHY,
@@ -28,10 +33,11 @@ from hub.calibration.rigid_body.linear_system import (
     linearised_rows,
     view_index,
 )
-from hub.calibration.rigid_body.motion import POSE
 from hub.calibration.rigid_body.noise import jitters, mark_inliers, noise, scatters, shape_stds
-from hub.calibration.rigid_body.problem import BodyProblem, BodyState
-from hub.trajectory.splines import SplineBasis
+from hub.calibration.rigid_body.problem import POSE, BodyMotion, BodyProblem, BodyState, frame_interval, rotated
+from hub.trajectory.discrete import PointBasis
+from hub.trajectory.splines import SUPPORT, SplineBasis
+from protocols.geometry.types import Floats, Ints
 from protocols.session.calibration import AdjustmentStep
 
 _ROUNDS, _STEPS = 5, 20  # of noise estimates; Levenberg-Marquardt steps in each
@@ -142,3 +148,117 @@ def _step(
     if problem.free_shape:
         shape = shape + camera_step[-shape.size :].reshape(-1, 3)
     return replace(state, cameras=tuple(cameras), bodies=tuple(bodies), shift=tuple(shifts), shape=shape)
+
+
+_CLUSTER_VIEWS, _CLUSTER_S = 3, 0.5
+"""Views, and seconds, whose errors count as one."""
+_WINDOW = 4  # control points on each side that the std of a pose is computed from
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyCovariance:
+    """cameras: (18 n, 18 n), zero where a parameter is fixed. inflation: of stds, the cameras' median one."""
+
+    cameras: Floats
+    inflation: float
+    system: ReducedSystem
+
+    def std(self, camera: int, column: int) -> float:
+        """Std of one parameter of a camera."""
+        return float(np.sqrt(max(self.block(camera)[column, column], 0.0)))
+
+    def block(self, camera: int) -> Floats:
+        """(18, 18) covariance of one camera's parameters."""
+        part = slice(camera * CAMERA_PARAMETERS, (camera + 1) * CAMERA_PARAMETERS)
+        return self.cameras[part, part]
+
+
+def body_covariance(problem: BodyProblem, state: BodyState) -> BodyCovariance:
+    """The cameras' covariance at an adjusted state."""
+    rows = [linearised_rows(problem, state, camera, False) for camera in range(len(problem.views))]
+    system, terms = assemble(problem, state, rows)
+    path = solveh_banded(system.band, system.border, lower=True)
+    reduced = np.linalg.pinv(system.corner - system.border.T @ path, hermitian=True)
+    scatter = _gradient_scatter(problem, state, terms, path)
+    sandwich = reduced @ scatter @ reduced
+    ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(reduced), 1e-300), 1.0))
+    enlarged = reduced * ratio[:, None] * ratio[None, :]
+    columns = np.concatenate(
+        [camera * CAMERA_PARAMETERS + np.array(problem.columns(camera), dtype=int) for camera in range(len(rows))]
+    ).astype(int)
+    full = np.zeros((CAMERA_PARAMETERS * len(rows),) * 2)
+    full[np.ix_(columns, columns)] = enlarged[: len(columns), : len(columns)]
+    for camera, jitter in enumerate(state.jitter):
+        # A clock is that of the mean time stamp, which is known as well as the mean of so many time errors.
+        at = camera * CAMERA_PARAMETERS + Column.OFFSET
+        for one in {camera, problem.reference}:
+            extra = float(state.jitter[one]) ** 2 / max(len(problem.views[one].time), 1)
+            full[at, at] += extra if camera != problem.reference and jitter >= 0.0 else 0.0
+    return BodyCovariance(full, float(np.median(ratio)) if len(ratio) else 1.0, system)
+
+
+def _gradient_scatter(problem: BodyProblem, state: BodyState, terms: list[ViewTerms], path: Floats) -> Floats:
+    """Sum over clusters of views of the outer products of their gradients, without the paths' part."""
+    total = np.zeros((path.shape[1], path.shape[1]))
+    for camera, term in enumerate(terms):
+        index = view_index(problem, state, camera)
+        score = -np.einsum("vp,vpc->vc", term.path, path[index[:, None] + np.arange(BLOCK)])
+        score[:, term.columns] += term.camera
+        views = problem.views[camera]
+        span = max(_CLUSTER_S, _CLUSTER_VIEWS * frame_interval(views))
+        cluster = np.unique(np.floor((views.time - views.time.min()) / span), return_inverse=True)[1]
+        sums = np.zeros((int(cluster.max()) + 1, score.shape[1]))
+        np.add.at(sums, cluster, score)
+        total += sums.T @ sums
+    return total
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathCovariance:
+    """Covariances (i, 28, 28) of a body's path by knot interval, with the cameras as they are. index: (i,) sorted
+    first control points of the intervals that have one."""
+
+    motion: BodyMotion
+    index: Ints
+    blocks: Floats
+
+    def point_stds(self, point: Floats, time: Floats) -> Floats:
+        """Stds (n,) of one axis of a point (3,) of the body at internal times (n,) within these intervals."""
+        at, weights, _, _ = self.motion.support(time)
+        pose = np.einsum("nk,nkp->np", weights, self.motion.control[at[:, None] + np.arange(SUPPORT)])
+        by_quaternion = rotated(pose[:, 3:], np.tile(point, (len(time), 1)))[1]
+        jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(time), 3, 3)), by_quaternion], axis=2)
+        by_path = (weights[:, None, :, None] * jacobian[:, :, None, :]).reshape(len(time), 3, BLOCK)
+        blocks = self.blocks[np.searchsorted(self.index, at)]
+        variance = np.einsum("nip,npq,niq->n", by_path, blocks, by_path, optimize=True) / 3.0
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def path_covariance(state: BodyState, covariance: BodyCovariance, body: int, time: Floats) -> PathCovariance:
+    """The path's covariances in the knot intervals of internal times (n,), each from a window of the path around it."""
+    motion = state.bodies[body]
+    first = sum(len(one.control) for one in state.bodies[:body])
+    reach = 0 if isinstance(motion.basis, PointBasis) else _WINDOW
+    index = np.unique(motion.support(time)[0])
+    blocks = np.zeros((len(index), BLOCK, BLOCK))
+    for number, at in enumerate(index.tolist()):
+        low, high = max(at - reach, 0), min(at + SUPPORT + reach, len(motion.control))
+        window = _dense(covariance.system.band, POSE * (first + low), POSE * (first + high))
+        begin = POSE * (at - low)
+        unit = np.eye(len(window))[:, begin : begin + BLOCK]
+        try:
+            blocks[number] = cho_solve(cho_factor(window, lower=True), unit)[begin : begin + BLOCK]
+        except np.linalg.LinAlgError:
+            blocks[number] = np.diag(np.full(BLOCK, np.inf))
+    return PathCovariance(motion, index, covariance.inflation**2 * blocks)
+
+
+def _dense(band: Floats, begin: int, end: int) -> Floats:
+    """The diagonal block of a symmetric matrix in lower banded form."""
+    size = end - begin
+    out = np.zeros((size, size))
+    for below in range(min(band.shape[0], size)):
+        values = band[below, begin : end - below]
+        out[np.arange(below, size), np.arange(size - below)] = values
+        out[np.arange(size - below), np.arange(below, size)] = values
+    return out

@@ -114,7 +114,7 @@ class _Scan:
     def _evaluate(self, lags: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         turn_b, place_b, known = self._interpolated(self._time + lags[:, None])
         count = (known * self._weight).sum(axis=1)
-        relative = _multiply(turn_b, _conjugate(self._turn_a))
+        relative = _multiply(turn_b, self._turn_a * np.array([1.0, -1.0, -1.0, -1.0]))
         weight = np.where(known, self._weight, 0.0)
         depth = np.linalg.norm(place_b, axis=2) + np.linalg.norm(self._place_a, axis=1)
         turn, place, cost = np.zeros((len(lags), 4)), np.zeros((len(lags), 3)), np.ones(known.shape)
@@ -204,10 +204,6 @@ def aligned(turn: Floats, order: Ints) -> Floats:
         if out[before] @ out[after] < 0.0:
             out[after] = -out[after]
     return out
-
-
-def _conjugate(turn: Floats) -> Floats:
-    return np.asarray(turn * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def _multiply(p: Floats, q: Floats) -> Floats:

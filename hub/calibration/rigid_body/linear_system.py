@@ -8,18 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from hub.bundle.bordered_system import THIRD_DIFFERENCE, third_difference_gradient, third_differences
-from hub.bundle.problem import ASPECT, CENTRE, FOCAL, K1, K2, K3, OFFSET, P1, RATE, READOUT
+from hub.bundle.problem import Column
 from hub.bundle.residuals import ResidualEvaluation, SplineSupport, evaluate_points, jacobians
 from hub.calibration.rigid_body.lag import rotations
-from hub.calibration.rigid_body.motion import POSE, rotated
-from hub.calibration.rigid_body.problem import BodyProblem, BodyState
+from hub.calibration.rigid_body.problem import POSE, BodyProblem, BodyState, rotated
 from hub.trajectory.splines import SUPPORT, SplineBasis
 from protocols.geometry.types import Bools, Floats, Ints
 
 BLOCK = SUPPORT * POSE
 """Parameters of a body's path that one view depends on."""
 # Prior stds of a lens that only the board determines: wide, they matter where few views do not.
-_PRIOR_STD = {K1: 0.3, K2: 0.3, K3: 0.2, ASPECT: 2e-3, P1: 1e-3, P1 + 1: 1e-3}
+_PRIOR_STD = {Column.K1: 0.3, Column.K2: 0.3, Column.K3: 0.2, Column.ASPECT: 2e-3, Column.P1: 1e-3, Column.P1 + 1: 1e-3}
 _CENTRE_STD = 0.02  # of the larger image side
 _RATE_STD = 1e-3  # of a clock's rate: ten times a crystal's
 _READOUT_STD = 0.02  # s: from none to a frame interval at 30 fps
@@ -166,7 +165,7 @@ def _add_camera(
     view, count = problem.views[camera].view, len(problem.views[camera].time)
     now = state.cameras[camera]
     # (2, 3 + columns, n): by the point, by the camera; the last column is the time's.
-    by_point = jacobians(rows.evaluation, now, [*columns, OFFSET])
+    by_point = jacobians(rows.evaluation, now, [*columns, Column.OFFSET])
     point, by_camera = by_point[:, :3].transpose(2, 0, 1), by_point[:, 3:].transpose(2, 0, 1)
     by_pose = point @ rows.pose_jacobian  # (n, 2, 7)
     by_path = (rows.weights[:, None, :, None] * by_pose[:, :, None, :]).reshape(len(view), 2, BLOCK)
@@ -280,9 +279,9 @@ def camera_priors(problem: BodyProblem, state: BodyState) -> list[tuple[int, int
     out: list[tuple[int, int, float, float]] = []
     for camera, (now, nominal) in enumerate(zip(state.cameras, problem.nominal, strict=True)):
         if problem.clock and camera != problem.reference:
-            out.append((camera, RATE, now.rate - 1.0, _RATE_STD))
+            out.append((camera, Column.RATE, now.rate - 1.0, _RATE_STD))
         if problem.clock and problem.free_readout[camera]:
-            out.append((camera, READOUT, now.readout, _READOUT_STD))
+            out.append((camera, Column.READOUT, now.readout, _READOUT_STD))
         if not problem.free_lens[camera]:
             continue
         lens = now.intrinsics
@@ -292,18 +291,18 @@ def camera_priors(problem: BodyProblem, state: BodyState) -> list[tuple[int, int
         aspect = np.log(lens.matrix[1, 1] / lens.matrix[0, 0])
         d = lens.distortions
         values = {
-            CENTRE: off[0],
-            CENTRE + 1: off[1],
-            ASPECT: aspect,
-            K1: d[0],
-            K2: d[1],
-            K3: d[2 if lens.fisheye else 4],
+            Column.CENTRE: off[0],
+            Column.CENTRE + 1: off[1],
+            Column.ASPECT: aspect,
+            Column.K1: d[0],
+            Column.K2: d[1],
+            Column.K3: d[2 if lens.fisheye else 4],
         }
         if not lens.fisheye:
-            values |= {P1: d[2], P1 + 1: d[3]}
+            values |= {Column.P1: d[2], Column.P1 + 1: d[3]}
         out += [
             (camera, column, float(value), _PRIOR_STD.get(column, _CENTRE_STD * side))
             for column, value in values.items()
         ]
-        out.append((camera, FOCAL, float(np.log(lens.focal / nominal.focal)), 1.0))
+        out.append((camera, Column.FOCAL, float(np.log(lens.focal / nominal.focal)), 1.0))
     return out

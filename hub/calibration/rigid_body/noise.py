@@ -9,7 +9,7 @@ from scipy.linalg import solveh_banded
 from scipy.special import chdtri
 
 from hub.bundle.bordered_system import third_differences
-from hub.bundle.problem import OFFSET
+from hub.bundle.problem import Column
 from hub.bundle.residuals import jacobians
 from hub.calibration.rigid_body.linear_system import assemble, linearised_rows
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, pitch
@@ -72,7 +72,7 @@ def jitters(problem: BodyProblem, state: BodyState) -> Floats:
         if out[camera] <= 0.0:
             continue
         rows = linearised_rows(problem, state, camera, False)
-        time = jacobians(rows.evaluation, state.cameras[camera], [OFFSET])[:, 3]
+        time = jacobians(rows.evaluation, state.cameras[camera], [Column.OFFSET])[:, 3]
         information = np.bincount(
             problem.views[camera].view, (time**2).sum(axis=0) * rows.weight, minlength=len(state.shift[camera])
         )

@@ -9,16 +9,16 @@ import numpy as np
 
 from hub.bundle.datum.gauge import fix_gauge
 from hub.bundle.initialisation import SEEN_WITHIN_S, seen_by_two
-from hub.bundle.problem import CAMERA_PARAMETERS, CENTRE, FOCAL, OFFSET, RATE, READOUT
+from hub.bundle.problem import CAMERA_PARAMETERS, Column
 from hub.calibration.notes import jitter_notes, readout_notes
+from hub.calibration.rigid_body.adjustment import BodyCovariance, body_covariance, path_covariance
 from hub.calibration.rigid_body.lag import BodyPair
 from hub.calibration.rigid_body.noise import residuals
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval
-from hub.calibration.rigid_body.uncertainty import BodyCovariance, body_covariance, path_covariance
 from hub.trajectory.discrete import INSTANT_TOLERANCE_S, PointBasis
 from hub.two_view.relative_pose import fundamental_from, relative_pose_between
+from protocols.core.acceptance import PairReport
 from protocols.core.clocks import TimeMap
-from protocols.core.pair_report import PairReport
 from protocols.core.version import VERSION
 from protocols.geometry.pose import Similarity
 from protocols.geometry.types import Floats
@@ -50,8 +50,8 @@ class BodySolution:
         covariance, out = body_covariance(self.problem, self.state), dict(self.estimated)
         for i, name in enumerate(self.names):
             if self.problem.free_lens[i]:
-                centre = max(covariance.std(i, CENTRE), covariance.std(i, CENTRE + 1))
-                out[name] = covariance.std(i, FOCAL), centre / self.state.cameras[i].intrinsics.focal
+                centre = max(covariance.std(i, Column.CENTRE), covariance.std(i, Column.CENTRE + 1))
+                out[name] = covariance.std(i, Column.FOCAL), centre / self.state.cameras[i].intrinsics.focal
         return out
 
 
@@ -71,17 +71,17 @@ def publish(rig: Rig, solution: BodySolution) -> Calibration:
             intrinsics=state.cameras[i].intrinsics,
             pose=world.pose(state.cameras[i].pose),
             time_map=maps[i],
-            time_offset_std=_relative_std(covariance, i, reference, OFFSET),
+            time_offset_std=_relative_std(covariance, i, reference, Column.OFFSET),
             position_std=_position_std(covariance, i, world)
             if solution.known is None
             else solution.known.cameras[name].position_std,
             rms_px=_rms(problem, state, i),
             focal_std=stds[name][0] if name in stds else 0.0,
             readout=float(np.clip(state.cameras[i].readout, -longest[name], longest[name])),
-            readout_std=covariance.std(i, READOUT),
+            readout_std=covariance.std(i, Column.READOUT),
             lag_time=state.cameras[i].centre + problem.views[i].time_origin,
-            lag_std=_relative_std(covariance, i, reference, OFFSET),
-            clock_rate_std=_relative_std(covariance, i, reference, RATE),
+            lag_std=_relative_std(covariance, i, reference, Column.OFFSET),
+            clock_rate_std=_relative_std(covariance, i, reference, Column.RATE),
         )
         for i, name in enumerate(names)
     }
@@ -186,7 +186,8 @@ def _trajectories(
     rate = max([1.0 / fastest, *(rig.cameras[name].fps for name in solution.names)])
     out = []
     owner = {label: (number, point) for number, body in enumerate(rig.bodies.values()) for label, point in body.items()}
-    order = {number: i for i, number in enumerate(_moving_bodies(solution))}
+    seen = sorted({int(number) for views in solution.problem.views for number in np.unique(views.body)})
+    order = {number: i for i, number in enumerate(seen)}
     for number, place in order.items():
         motion = state.bodies[place]
         within = SEEN_WITHIN_S
@@ -211,11 +212,6 @@ def _trajectories(
                 std = world.scale * path.point_stds(point, inside)
                 out.append(TrajectoryTable(label, time, world.points(position[finite]), std))
     return tuple(out)
-
-
-def _moving_bodies(solution: BodySolution) -> list[int]:
-    """Numbers of the bodies that have a motion: those that were seen."""
-    return sorted({int(number) for views in solution.problem.views for number in np.unique(views.body)})
 
 
 def _observed(problem: BodyProblem, state: BodyState, label: int) -> list[Floats]:

@@ -8,16 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hub.bundle.preprocessing import nominal_intrinsics
-from hub.bundle.problem import FOCAL, OFFSET
-from hub.calibration.rigid_body.adjustment import adjust_bodies
-from hub.calibration.rigid_body.lag import BodyPair
+from hub.bundle.problem import Column
+from hub.calibration.rigid_body.adjustment import adjust_bodies, body_covariance
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval, initial_jitter, initial_shape
 from hub.calibration.rigid_body.result import BodySolution, publish
 from hub.calibration.rigid_body.start import initial_lens, largest_group, orient_views, solve_body_pairs, start_bodies
-from hub.calibration.rigid_body.uncertainty import body_covariance
 from hub.calibration.rigid_body.views import CameraViews, body_labels, gather_views, thinned, view_poses
+from protocols.core.acceptance import PairReport
 from protocols.core.errors import Refused
-from protocols.core.pair_report import PairReport
 from protocols.geometry.camera import Intrinsics
 from protocols.session.calibration import Calibration, FixedCalibration
 from protocols.session.observations import Observations
@@ -125,7 +123,7 @@ def _solve(given: _Input, report: Progress, shared_clock: bool) -> BodySolution:
             raise Refused(
                 f"no two cameras could be connected by the board's motion ({_listed(refused)})",
                 refused,
-                pairs=_failed(pairs),
+                pairs=tuple(PairReport(pair, found.reason or "ok") for pair, found in pairs.items()),
             )
         names = list(group)
         if given.known is not None:
@@ -177,7 +175,7 @@ def _unacceptable(solution: BodySolution) -> tuple[str, str]:
         return names[worst], f"only {100 * shares[worst]:.0f} % of its corners fit the board that the others saw"
     covariance = body_covariance(problem, state)
     for camera, name in enumerate(names):
-        std = covariance.std(camera, FOCAL)
+        std = covariance.std(camera, Column.FOCAL)
         if problem.free_lens[camera] and not std <= MAX_BOARD_FOCAL_STD:
             return name, (
                 f"the board determines its focal length only to {100 * std:.0f} % (std): tilt the board towards it, "
@@ -186,7 +184,7 @@ def _unacceptable(solution: BodySolution) -> tuple[str, str]:
         turn = max(covariance.std(camera, column) for column in range(3))
         if not turn <= _MAX_ROTATION_STD:
             return name, f"the board determines its orientation only to {np.degrees(turn):.1f}° (std)"
-        clock = covariance.std(camera, OFFSET)
+        clock = covariance.std(camera, Column.OFFSET)
         limit = _MAX_CLOCK_FRAMES * frame_interval(problem.views[camera])
         if problem.clock and not clock <= limit:
             return name, f"the board's motion determines its clock only to {1e3 * clock:.0f} ms (std): move it faster"
@@ -205,7 +203,7 @@ def _is_in_step(solution: BodySolution) -> bool:
     covariance = body_covariance(problem, state)
     interval = np.sqrt(12.0) * state.jitter
     lags = np.abs(np.array(list(_stamp_lags(solution).values())))
-    stds = np.array([covariance.std(camera, OFFSET) for camera in range(len(lags))])
+    stds = np.array([covariance.std(camera, Column.OFFSET) for camera in range(len(lags))])
     return bool((lags <= np.maximum(interval, interval[problem.reference]) + 3.0 * stds).all())
 
 
@@ -231,7 +229,7 @@ def _in_step(given: _Input, free: BodySolution, report: Progress) -> BodySolutio
     solution = _solve(fixed, report, True)
     lags = _stamp_lags(free)
     covariance = body_covariance(free.problem, free.state)
-    stds = {name: covariance.std(camera, OFFSET) for camera, name in enumerate(free.names)}
+    stds = {name: covariance.std(camera, Column.OFFSET) for camera, name in enumerate(free.names)}
     late = ", ".join(f"{name} {1e3 * lag:+.0f} ms" for name, lag in lags.items() if abs(lag) > 3.0 * stds[name])
     warning = (
         "the clips have the same time stamps, and lags as of a recorder that takes each camera's latest image: "
@@ -240,10 +238,6 @@ def _in_step(given: _Input, free: BodySolution, report: Progress) -> BodySolutio
     warnings = (warning, *((f"by the board's motion, exposures differ from the stamps: {late}",) if late else ()))
     estimated = {name: std for name, std in free.lens_stds().items() if name in solution.names}
     return replace(solution, warnings=warnings, estimated=estimated)
-
-
-def _failed(pairs: Mapping[tuple[str, str], BodyPair]) -> tuple[PairReport, ...]:
-    return tuple(PairReport(pair, found.reason or "ok") for pair, found in pairs.items())
 
 
 def _listed(reasons: Mapping[str, str]) -> str:

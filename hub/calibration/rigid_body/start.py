@@ -11,8 +11,7 @@ import numpy as np
 
 from hub.bundle.problem import CameraState
 from hub.calibration.rigid_body.lag import BodyPair, aligned, quaternions, solve_body_pair
-from hub.calibration.rigid_body.motion import BodyMotion, fit_motion
-from hub.calibration.rigid_body.problem import frame_interval
+from hub.calibration.rigid_body.problem import BodyMotion, fit_motion, frame_interval
 from hub.calibration.rigid_body.views import CameraViews, ViewPoses, turned, view_poses
 from hub.trajectory.discrete import PointBasis, merged_instants
 from hub.trajectory.splines import SplineBasis, split_at_gaps

@@ -17,9 +17,11 @@ from google.protobuf.message import Message
 
 from hub.distributed.factors.factor import QuadraticFactor
 from hub.distributed.network.association import MAX_GAP_S
-from hub.distributed.network.messages import ControlPoint, Notice, SharedObservation, StateMessage
-from hub.distributed.network.node import PoseNode
-from hub.distributed.network.serialisation import (
+from hub.distributed.network.messages import (
+    ControlPoint,
+    Notice,
+    SharedObservation,
+    StateMessage,
     edges_from_wire,
     edges_to_wire,
     name_of,
@@ -27,6 +29,7 @@ from hub.distributed.network.serialisation import (
     state_from_wire,
     state_to_wire,
 )
+from hub.distributed.network.node import PoseNode
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from hub.distributed.factors.factor import Edge
 from hub.distributed.factors.initialise import resect
 from hub.distributed.network.block_solver import intersect_rays, pose_from_relative
-from hub.distributed.network.messages import StateMessage
+from hub.distributed.network.messages import SharedObservation, StateMessage
 from protocols.geometry.pose import Pose
 
 LocalisedNeighbour: TypeAlias = tuple[StateMessage, Edge]
@@ -69,3 +70,40 @@ def localise_by_resection(neighbours: list[LocalisedNeighbour], rng: np.random.G
         return None
     found = resect(np.concatenate(mine), np.concatenate(there), np.concatenate(spread), rng)
     return None if found is None else Pose(found.rotation, found.centre)
+
+
+_REORDER_WINDOW = 256
+"""Largest reordering of one camera's messages."""
+_RECEIVED_MASK = (1 << _REORDER_WINDOW) - 1
+
+
+@dataclass(slots=True, eq=False)
+class Neighbour:
+    """Data of one neighbour. state: the last received. highest_sequence, received_mask: observations received."""
+
+    edge: Edge
+    boot: int = -1
+    highest_sequence: int = -1
+    received_mask: int = 0
+    state: StateMessage | None = None
+    state_age: int = 0
+    """Own updates since the last state was received."""
+
+    def rejection_reason(self, seen: SharedObservation) -> str:
+        """Why an observation is rejected: a duplicate, or too late (distributed pose paper, step 1); "" if accepted."""
+        if seen.boot != self.boot:
+            if seen.boot < self.boot:
+                return "earlier boot"
+            self.boot, self.highest_sequence, self.received_mask = seen.boot, -1, 0
+        ahead = seen.sequence - self.highest_sequence
+        if ahead > 0:
+            self.received_mask = ((self.received_mask << ahead) | 1) & _RECEIVED_MASK if ahead < _REORDER_WINDOW else 1
+            self.highest_sequence = seen.sequence
+            return ""
+        if -ahead >= _REORDER_WINDOW:
+            return "too late"
+        bit = 1 << -ahead
+        if self.received_mask & bit:
+            return "duplicate"
+        self.received_mask |= bit
+        return ""

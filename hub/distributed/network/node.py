@@ -26,7 +26,7 @@ from hub.distributed.network.block_solver import (
     retract,
 )
 from hub.distributed.network.datum import accepted_anchors, control_point_factor, find_outliers, world_from_network
-from hub.distributed.network.localisation import localise, localise_by_resection
+from hub.distributed.network.localisation import Neighbour, localise, localise_by_resection
 from hub.distributed.network.messages import (
     Anchor,
     ControlPoint,
@@ -37,7 +37,6 @@ from hub.distributed.network.messages import (
     StateMessage,
 )
 from hub.distributed.network.moved_camera import EdgeJacobian, detect_motion
-from hub.distributed.network.neighbour import Neighbour
 from protocols.geometry.pose import Pose, Similarity
 
 _BATCH = 256

@@ -18,8 +18,7 @@ from mcap.records import Channel
 from mcap.records import Metadata as MetadataRecord
 
 from protocols.core.errors import InputError
-from protocols.log.layout import CHANNEL_RECORD, channel_record
-from protocols.log.read.index import read_index
+from protocols.log.layout import CHANNEL_RECORD, channel_record, upgrades_for
 from protocols.log.read.mcap_records import (
     MALFORMED,
     Damage,
@@ -29,9 +28,9 @@ from protocols.log.read.mcap_records import (
     chunk_records,
     message_record,
     open_log,
+    read_index,
     read_records,
 )
-from protocols.log.read.migration import upgrades_for
 from protocols.log.read.parts import find_parts, log_format
 from protocols.log.schemas import is_foxglove
 from protocols.topics import TOPICS_BY_NAME, Topic

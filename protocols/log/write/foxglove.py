@@ -32,11 +32,11 @@ from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.jpeg import ThumbnailScale, thumbnail_scale
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.log.schemas import FOXGLOVE_PREFIX
-from protocols.log.write.thumbnails import ThumbnailScale, thumbnail_scale
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import METRES_PER_UNIT
 

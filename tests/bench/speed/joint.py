@@ -26,7 +26,7 @@ from hub.bundle.bordered_system import THIRD_DIFFERENCE, third_differences
 from hub.bundle.initialisation import _camera_state, triangulate_and_adjust
 from hub.bundle.normal_equations import build_system
 from hub.bundle.preprocessing import prepare
-from hub.bundle.problem import CAMERA_PARAMETERS, RATE, AdjustmentState, FreeParameters, Problem
+from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, Column, FreeParameters, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.calibration import final_adjustment, pipeline
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
@@ -201,7 +201,7 @@ class Stacked:
             values.append(np.repeat(coefficient * self.root, 3))
         top += 3 * len(starts)
         for camera in range(len(self.task.start.cameras)):
-            column = self.place[camera * CAMERA_PARAMETERS + RATE]
+            column = self.place[camera * CAMERA_PARAMETERS + Column.RATE]
             if column >= 0:
                 rows.append(np.array([top + camera]))
                 columns.append(np.array([column]))

@@ -11,11 +11,10 @@ import pytest
 from protocols.bus.base import AgentEvent, Bus, BusDead
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
-from protocols.bus.transport.delivery import cache_size
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.errors import InputError
-from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, Topic
+from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS, Topic, cache_size
 from protocols.validation.rules import Rejected
 from tests.support.receiving import collect, matched, sequences
 from tests.support.samples import calibration, camera_info, eventually, observation, rig_info

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from protocols.core.clocks import TimeMap
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics

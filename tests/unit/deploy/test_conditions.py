@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.agents.conditions import Conditions
+from deploy.agents.startup_checks import Conditions
 from deploy.config.agents import CameraConfig, RecorderConfig
 from protocols.bus.security.tls import check_files
 from protocols.bus.settings import BusConfig, TlsConfig

@@ -20,7 +20,7 @@ import pytest
 from deploy.agents.health import Health, HealthServer
 from deploy.cli import run
 from deploy.config.agents import HealthConfig, HubConfig
-from deploy.site.doctor import agent, autopilot, machine, network, selection
+from deploy.site.doctor import agent, autopilot, machine, selection
 from deploy.site.doctor.check_result import CheckResult, exit_status, misconfigured, ok, unavailable, warn
 from edge.agents.clock_quality import kernel_clock
 from edge.devices.base import DeviceInfo, Frame
@@ -244,8 +244,8 @@ def test_two_network_troubles_read_differently(monkeypatch: pytest.MonkeyPatch) 
         (OSError(errno.ENETUNREACH, "no network"), "DHCP"),
         (socket.gaierror(-2, "Name or service not known"), "/etc/hosts"),
     ):
-        monkeypatch.setattr("deploy.site.doctor.network.socket.create_connection", fails_with(error))
-        found = network.reach("tcp/router.site:7447")
+        monkeypatch.setattr("deploy.site.doctor.agent.socket.create_connection", fails_with(error))
+        found = agent.reach("tcp/router.site:7447")
         assert found is not None
         check(found, "fail", remedy)
         texts.append(found.text)
@@ -271,14 +271,14 @@ def test_a_running_agent_is_asked_for_its_health() -> None:
     with HealthServer(HealthConfig(listen="127.0.0.1:0"), health) as server:
         config = HubConfig(health=HealthConfig(listen=server.address))
         health.seen(pb.AgentStatus(agent="hub", role="hub", state="degraded", message="no router at x for 3 s"))
-        found = network.running_agent(config)
+        found = agent.running_agent(config)
         check(found, "warn", "names")
         assert found.text == "degraded: no router at x for 3 s"
         health.seen(pb.AgentStatus(agent="hub", role="hub", state="running", message="3 cameras calibrated"))
-        check(network.running_agent(config), "ok")
-        check(network.running_agent(msgspec.structs.replace(config, id="hub2")), "fail", "port of its own")
-    check(network.running_agent(config), "fail", "start it")
-    check(network.running_agent(HubConfig()), "skip")
+        check(agent.running_agent(config), "ok")
+        check(agent.running_agent(msgspec.structs.replace(config, id="hub2")), "fail", "port of its own")
+    check(agent.running_agent(config), "fail", "start it")
+    check(agent.running_agent(HubConfig()), "skip")
 
 
 class Device:

@@ -15,7 +15,7 @@ import tomli_w
 from deploy.offline.follow.calibration import read_given_calibration
 from deploy.offline.follow.objects import followed_detections, object_messages, read_objects
 from deploy.offline.follow.source import FollowInput, read_follow_input
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from protocols.core.errors import InputError, Refused
 from protocols.geometry.pose import POSE_CONVENTIONS, Pose
 from tests.support import crowds

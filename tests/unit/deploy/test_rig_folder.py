@@ -13,7 +13,7 @@ from deploy.config.file import load
 from deploy.site.fleet import read_state
 from deploy.site.rig_folder import SHIPPED, find_rig, read_rig_folder, write_agent_configs
 from edge import scenes
-from edge.scenes.common.rescaling import rescale_intrinsics, rescale_scene
+from edge.scenes.common.base import rescale_intrinsics, rescale_scene
 from protocols.core.errors import InputError
 from protocols.session.rig import read_rig
 from tests.support.command_line import refusal

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from hub.report import build_report, measures
-from hub.report.convergence import adjustment_history
 from hub.report.quality_assessment import assess_quality, assess_refusal, capital
-from hub.report.remedies import remedy_for
 from hub.report.svg import number, short, ticks
+from hub.report.time_figures import adjustment_history
+from hub.report.wording import remedy_for
 from protocols.core.errors import Refused
 from protocols.session.calibration import AdjustmentStep, Calibration
 from protocols.session.observations import Observations

@@ -18,8 +18,7 @@ from edge.detectors.moving.foreground import (
     BackgroundSubtractor,
     background_mode,
 )
-from edge.detectors.moving.ghosts import is_ghost, remove_ghosts, uncovered_background
-from edge.detectors.moving.shadows import ShadowDetector
+from edge.detectors.moving.shadows import ShadowDetector, is_ghost, remove_ghosts, uncovered_background
 from edge.detectors.moving.vehicle import VehicleDetector
 from edge.detectors.people.height_model import HeightModel
 from edge.detectors.people.person import PersonDetector, clean_silhouettes, silhouette_features

@@ -14,18 +14,10 @@ from hub.bundle.bordered_system import BAND, BorderedSystem, PathByCameras, bord
 from hub.bundle.covariance import constrained_step, inverse_blocks
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import (
-    ASPECT,
     CAMERA_PARAMETERS,
-    CENTRE,
-    FOCAL,
-    K1,
-    K2,
-    K3,
-    OFFSET,
-    P1,
-    RATE,
     AdjustmentState,
     CameraState,
+    Column,
     FreeParameters,
     LensPrior,
     Problem,
@@ -87,7 +79,7 @@ def test_every_camera_jacobian_column_matches_finite_differences(lens: str, colu
     path = state.trajectories[rows.label]
     line = linearise(rows, camera, path)
     assert line.valid.all()
-    if lens == "fisheye" and column >= P1:
+    if lens == "fisheye" and column >= Column.P1:
         assert not line.camera_jacobian[:, :, column].any()  # never free
         return
     step = 1e-6
@@ -204,9 +196,11 @@ def test_the_priors_add_their_information() -> None:
     gained = with_priors.corner.diagonal() - without.corner.diagonal()
     free_parameters = problem.free_parameters
     for value, column in zip(gained, problem.free_columns, strict=True):
-        std = {RATE: free_parameters.rate_std, FOCAL: free_parameters.focal_std, K1: free_parameters.k1_std}.get(
-            column % CAMERA_PARAMETERS
-        )
+        std = {
+            Column.RATE: free_parameters.rate_std,
+            Column.FOCAL: free_parameters.focal_std,
+            Column.K1: free_parameters.k1_std,
+        }.get(column % CAMERA_PARAMETERS)
         assert value == pytest.approx(0.0 if std is None else std**-2, rel=1e-3, abs=1e-3)
 
 
@@ -216,13 +210,25 @@ def test_an_unmeasured_lens_is_free_under_its_own_prior_and_the_others_are_not()
     guess = LensPrior(1.1 * lens.focal, 0.2, (300.0, 250.0), 5.0, 0.05, 0.1, -0.02, 0.04)
     one = replace(problem, lens_priors=(None, guess, None))
     added = set(one.free_columns.tolist()) - set(problem.free_columns.tolist())
-    assert added == {CAMERA_PARAMETERS + column for column in (FOCAL, K1, *range(CENTRE, CAMERA_PARAMETERS))}
+    assert added == {
+        CAMERA_PARAMETERS + column for column in (Column.FOCAL, Column.K1, *range(Column.CENTRE, CAMERA_PARAMETERS))
+    }
     loose = replace(
         one, lens_priors=(None, LensPrior(lens.focal, 1e9, (0.0, 0.0), 1e9, 0.0, 1e9, 0.0, 1e9, 1e9, 1e9, 1e9), None)
     )
     (with_prior, cost), (without, bare) = (build_system(p, state, prior, robust=False) for p in (one, loose))
     gained = dict(zip(one.free_columns.tolist(), with_prior.corner.diagonal() - without.corner.diagonal(), strict=True))
-    stds = {FOCAL: 0.2, CENTRE: 5.0, CENTRE + 1: 5.0, K1: 0.1, K2: 0.04, K3: 0.01, ASPECT: 2e-3, P1: 2e-3, P1 + 1: 2e-3}
+    stds = {
+        Column.FOCAL: 0.2,
+        Column.CENTRE: 5.0,
+        Column.CENTRE + 1: 5.0,
+        Column.K1: 0.1,
+        Column.K2: 0.04,
+        Column.K3: 0.01,
+        Column.ASPECT: 2e-3,
+        Column.P1: 2e-3,
+        Column.P1 + 1: 2e-3,
+    }
     for column, value in gained.items():
         std = stds.get(column - CAMERA_PARAMETERS)
         assert value == pytest.approx(0.0 if std is None else std**-2, rel=1e-3, abs=1e-3)
@@ -376,7 +382,9 @@ def test_the_time_offset_column_is_the_velocity() -> None:
     rows, camera = problem.rows[0], state.cameras[0]
     line = linearise(rows, camera, state.trajectories[0])
     lever = (rows.time[rows.use] - camera.centre)[:, None]
-    np.testing.assert_allclose(line.camera_jacobian[:, :, RATE], line.camera_jacobian[:, :, OFFSET] * lever, atol=1e-9)
+    np.testing.assert_allclose(
+        line.camera_jacobian[:, :, Column.RATE], line.camera_jacobian[:, :, Column.OFFSET] * lever, atol=1e-9
+    )
 
 
 def test_a_row_that_a_clock_moves_past_the_end_of_the_path_still_has_a_gradient() -> None:

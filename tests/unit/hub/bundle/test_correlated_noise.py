@@ -17,13 +17,7 @@ from hub.bundle.noise import correlated_noise
 from hub.bundle.noise.correlated_noise import lens_tolerance, prefers_nominal_lenses, refit_with_correlated_noise
 from hub.bundle.noise.gauss_markov import GaussMarkov, estimate_correlated_noise, fit_maximum_likelihood
 from hub.bundle.noise.noise_scale import correlation_inflation, modelled_inflation, rescale_noise
-from hub.bundle.problem import (
-    FOCAL,
-    AdjustmentState,
-    CameraState,
-    CorrelatedNoise,
-    Problem,
-)
+from hub.bundle.problem import AdjustmentState, CameraState, Column, CorrelatedNoise, Problem
 from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from protocols.geometry.camera import Intrinsics
@@ -220,7 +214,7 @@ def test_a_slight_correlation_counts_where_lenses_were_not_measured() -> None:
     def focal_std(one: AdjustmentState) -> float:
         scaled = rescale_noise(free, one, estimate_smoothness(free, one))
         found = covariance(free, scaled, estimate_smoothness(free, scaled))
-        return float(np.sqrt(found.variances[:, FOCAL]).mean())
+        return float(np.sqrt(found.variances[:, Column.FOCAL]).mean())
 
     assert focal_std(after) > 1.2 * focal_std(estimated)
 
@@ -258,7 +252,7 @@ def test_the_bayes_factor_of_nominal_lenses_is_the_savage_dickey_ratio() -> None
     tight = np.diag(np.full(len(columns), 1e-12))
     first = state.cameras[0]
     off = replace(state, cameras=(replace(first, intrinsics=zoomed(first.intrinsics, 1.005)), *state.cameras[1:]))
-    place = int(np.flatnonzero(columns == FOCAL)[0])
+    place = int(np.flatnonzero(columns == Column.FOCAL)[0])
     vague = tight.copy()
     vague[place, place] = 0.01**2
     assert prefers_nominal_lenses(free_lenses, GlsSolution(state, 0.0, DenseCovariance(tight)))

@@ -7,18 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.bundle import covariance as cov
 from hub.bundle.adjustment import adjust
 from hub.bundle.block_matrix import BlockSum, DenseCovariance
-from hub.bundle.problem import (
-    CAMERA_PARAMETERS,
-    OFFSET,
-    RATE,
-    AdjustmentState,
-    CameraState,
-    Problem,
-)
+from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, CameraState, Column, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.calibration.pipeline import calibrate
 from protocols.geometry.types import Floats
@@ -175,8 +168,8 @@ def test_relative_clock_stds_are_those_in_the_middle_of_the_common_span(
         for part, span in zip(problem.rows, spans, strict=True)
     )
     variance = np.zeros(3 * CAMERA_PARAMETERS)
-    variance[OFFSET::CAMERA_PARAMETERS] = [0.0, 1e-6, 4e-6]
-    variance[RATE::CAMERA_PARAMETERS] = [1e-8, 4e-8, 0.0]
+    variance[Column.OFFSET :: CAMERA_PARAMETERS] = [0.0, 1e-6, 4e-6]
+    variance[Column.RATE :: CAMERA_PARAMETERS] = [1e-8, 4e-8, 0.0]
     found = cov.CameraCovariance(np.arange(len(variance)), 3, DenseCovariance(np.diag(variance)))
     stds = cov.relative_clock_stds(found, replace(problem, rows=rows), replace(state, cameras=cameras))
     assert stds[0, 1] == pytest.approx(np.sqrt(1e-6 + 4.0**2 * 1e-8 + 10.0**2 * 4e-8))

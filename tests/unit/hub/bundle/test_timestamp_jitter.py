@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hub.calibration.final_adjustment
-from hub.bundle.problem import OFFSET, CameraState, TrackObservations
+from hub.bundle.problem import CameraState, Column, TrackObservations
 from hub.calibration.pipeline import calibrate
 from protocols.session.calibration import Calibration
 from tests.support import rigs
@@ -112,7 +112,7 @@ def test_rows_with_jitter_have_its_covariance_along_their_motion() -> None:
     rows = TrackObservations(0, 0, time, seen + rng.normal(0.0, 2.0, seen.shape), np.ones(40, dtype=np.bool_))
     along = rng.uniform(1.0, 9.0, 40)
     plain, white = linearise(rows, camera, path), linearise(replace(rows, along_std=along), camera, path)
-    velocity = plain.camera_jacobian[:, :, OFFSET]
+    velocity = plain.camera_jacobian[:, :, Column.OFFSET]
     unit = velocity / np.linalg.norm(velocity, axis=1)[:, None]
     inverse = np.linalg.inv(np.eye(2) + (along**2 - 1.0)[:, None, None] * unit[:, :, None] * unit[:, None, :])
     jacobians = [(one.camera_jacobian, one.point_jacobian) for one in (plain, white)]

@@ -11,8 +11,7 @@ from hub.bundle import clock_steps
 from hub.bundle.problem import ClockStep
 from hub.calibration.incremental import update_calibration
 from hub.calibration.pipeline import calibrate
-from hub.clocks.arrival_prior import ERROR_BOUND_S, ArrivalPriors
-from hub.clocks.external_prior import ExternalClockPrior
+from hub.clocks.external_prior import ERROR_BOUND_S, ArrivalPriors, ExternalClockPrior
 from protocols.core.clocks import CameraTime
 from protocols.core.errors import Refused
 from protocols.geometry import so3

@@ -13,9 +13,8 @@ from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.calibration.pairs.pair_network import _leave_to_resection, solve_pairs
 from hub.calibration.pairs.synchronised_groups import SynchronisedGroups
 from hub.sync.hypothesis import PairSolution
-from hub.sync.pair_ranking import ranking_score
 from hub.sync.pair_solver import _PairSearch, solve_pair
-from hub.sync.track_cache import TrackCache
+from hub.sync.track_cache import TrackCache, ranking_score
 from hub.trajectory.image_tracks import smooth_only
 from tests.support.rigs import Session, simulate
 

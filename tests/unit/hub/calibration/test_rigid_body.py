@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hub.calibration.pipeline import calibrate
-from hub.calibration.rigid_body.motion import rotated
+from hub.calibration.rigid_body.problem import rotated
 from protocols.core.errors import Refused
 from protocols.geometry import so3
 from protocols.session.calibration import Calibration, read_calibration

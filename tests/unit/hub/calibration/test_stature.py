@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hub.calibration.people.stature import check_stature
+from hub.calibration.acceptance import check_stature
 from protocols.core.errors import Refused
 from protocols.session.calibration import TrajectoryTable
 

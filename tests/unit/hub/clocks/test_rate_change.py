@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hub.clocks.change_detector import ClockChange
-from hub.clocks.rate_change import RateChange, RateChanges
+from hub.clocks.segments import RateChange, RateChanges
 from hub.live.live_hub import LiveHub, LiveSettings
 from protocols.messages import syncline_pb2 as pb
 from tests.bench.live_clocks import CHANGED, CHANGES_AT_S, Change, stream

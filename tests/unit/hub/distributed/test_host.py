@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hub.distributed.network.host import ROLE, NodeHost
-from hub.distributed.network.serialisation import edges_from_wire, name_of, number_of
+from hub.distributed.network.messages import edges_from_wire, name_of, number_of
 from hub.distributed.solver import node_calibration
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose

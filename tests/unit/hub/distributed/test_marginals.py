@@ -7,7 +7,7 @@ import pytest
 
 from hub.bundle.datum.gauge import fix_gauge
 from hub.distributed.factors.factor import QuadraticFactor
-from hub.distributed.network.marginals import connected_cameras, merge_duplicate_factors, position_stds
+from hub.distributed.network.block_solver import connected_cameras, merge_duplicate_factors, position_stds
 from protocols.geometry.types import Floats
 from protocols.session.rig import Rig, RigCamera
 from tests.bench.pose_runs import Network, feed, network

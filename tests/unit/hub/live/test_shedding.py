@@ -8,9 +8,8 @@ import time
 import pytest
 
 from hub.live import agent
-from hub.live.fair_share import FairShare
+from hub.live.fair_share import FairShare, Shedding
 from hub.live.live_hub import LiveHub
-from hub.live.shedding import Shedding
 from hub.view.state import ViewState
 from protocols.bus.base import Received
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
@@ -54,7 +53,7 @@ def test_one_who_sends_too_much_makes_the_hub_late_for_nobody_else() -> None:
 def test_a_late_hub_is_degraded_on_the_page_until_it_has_caught_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(agent, "_BACKLOG_S", 0.0)
     monkeypatch.setattr(agent, "_STATUS_S", 0.05)
-    monkeypatch.setattr("hub.live.shedding._STATED_S", 0.3)
+    monkeypatch.setattr("hub.live.fair_share._STATED_S", 0.3)
     monkeypatch.setattr(LiveHub, "state", lambda self, now: ("calibrated", ""))
     late_s, view = [5.0], ViewState()
     network = MemoryHub(clock_ns=lambda: time.time_ns() - round(late_s[0] * 1e9))

@@ -28,7 +28,7 @@ from edge.uav.prediction.particle_filter import densest_cluster
 from edge.uav.target.motion_history import MotionHistory
 from hatch_build import FLAGS
 from hub.bundle.bordered_system import PathBlocks, add_rows
-from hub.bundle.problem import OFFSET, READOUT, CameraState, TrackObservations, Trajectory, UsedRows
+from hub.bundle.problem import CameraState, Column, TrackObservations, Trajectory, UsedRows
 from hub.bundle.residuals import SplineSupport, StackedTrajectories, evaluate_points, jacobians
 from hub.sync.lag_scan import smallest_eigenvalues
 from hub.sync.pair_solver import solve_pair
@@ -193,7 +193,7 @@ def test_rows_are_projected_alike_with_all_derivatives(both: Both, bent: list[fl
         support = SplineSupport(control, index, weights, weights[::-1].copy())
         given = rng.random(200) < 2.0, np.linspace(0.0, 9.0, 200), np.full((200, 2), 300.0), support, np.ones(200)
         found = evaluate_points(camera, points, *given)
-        by = jacobians(found, camera, [*range(10), READOUT]), jacobians(found, camera, [4, OFFSET])
+        by = jacobians(found, camera, [*range(10), Column.READOUT]), jacobians(found, camera, [4, Column.OFFSET])
         every = *by, found.residual[None], found.normalised[None], found.camera_points[None]
         return np.concatenate([found.valid, *(one[..., found.valid].ravel() for one in every)])
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter import kalman
 from hub.tracking.filter.kalman import LOG_SIZE, STATE_DIM, VELOCITY

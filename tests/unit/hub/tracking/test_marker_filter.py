@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.tracking.association.triangulation import initial_motion
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.jerk_model import STATE_DIM, jerk_model, rts_smooth

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deploy.evaluation.clear_mot import EvaluationFrame, MotScores, clear_mot
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.tracking import offline
 from hub.tracking.association.continuation import EntryExitRates
 from hub.tracking.association.initiation import LengthScale

@@ -10,7 +10,7 @@ import pytest
 
 from deploy.evaluation.tracking_scores import score_tracks
 from edge import scenes
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.tracking.association.initiation import LengthScale
 from hub.tracking.calibration.vertical import VerticalEstimator
 from hub.tracking.detections import TrackingCamera, frame_detections

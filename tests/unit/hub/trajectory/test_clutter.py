@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.bundle.preprocessing import prepare
-from hub.trajectory.clutter import static_clutter
+from hub.bundle.preprocessing import prepare, static_clutter
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations
 from tests.support.rigs import random_path, simulate

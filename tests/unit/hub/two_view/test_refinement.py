@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.two_view import relative_pose as two_view
 from hub.two_view.refinement import FINAL_WIDTH, SEARCH_WIDTH, NoiseModel, PointPairs, RefinementResult, refine
 from hub.two_view.relative_pose import FundamentalMatrix, RelativePose, TwoViewGeometry, relative_pose_between

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge.scenes.common.placement import look_at_pose
+from edge.scenes.common.base import look_at_pose
 from hub.two_view import relative_pose
 from hub.two_view.relative_pose import FundamentalMatrix, RelativePose, TwoViewGeometry
 from protocols.geometry import so3

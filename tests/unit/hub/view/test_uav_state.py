@@ -11,8 +11,7 @@ import pytest
 from hub.view.player import LogRecording, Player
 from hub.view.scene_renderer import decode_rgb
 from hub.view.state import ViewState
-from hub.view.uav_overlay import draw_uav, pad_to_aspect, uav_panel_html
-from hub.view.uav_state import UavView
+from hub.view.uav_overlay import UavView, draw_uav, pad_to_aspect, uav_panel_html
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import FLIGHT_IMAGE, TARGET, UAV_INFO

@@ -12,10 +12,9 @@ from deploy.agents.startup_checks import check_startup
 from deploy.config.agents import HubConfig
 from deploy.config.file import load
 from protocols.bus.settings import BusConfig, TlsConfig, is_loopback, unprotected_listeners
-from protocols.bus.transport.delivery import cache_size
 from protocols.bus.transport.session import LEASE_MS, MAX_MESSAGE_SIZE, _settings
 from protocols.core.errors import InputError
-from protocols.topics import OBSERVATION, STATUS
+from protocols.topics import OBSERVATION, STATUS, cache_size
 
 
 def opened_with(config: BusConfig, key: str) -> Any:

@@ -15,8 +15,7 @@ import zstandard
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from mcap.opcode import Opcode
 
-from protocols.log.read.index import read_index
-from protocols.log.read.mcap_records import MAGIC, Damage, McapRecord, chunk_records, read_records
+from protocols.log.read.mcap_records import MAGIC, Damage, McapRecord, chunk_records, read_index, read_records
 from protocols.log.read.reader import LogReader
 from protocols.log.write.foxglove import FoxgloveConverter
 from protocols.log.write.writer import LogWriter

@@ -11,12 +11,11 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from deploy.cli import run
-from edge.detectors.network import model_file, runtime
+from edge.detectors.network import runtime
 from edge.detectors.network.decode import Boxes
 from edge.detectors.network.description import NetworkDescription
 from edge.detectors.network.detector import boxes_in_image, prepare
-from edge.detectors.network.model_file import check_model_file
-from edge.detectors.network.runtime import open_runtime
+from edge.detectors.network.runtime import check_model_file, open_runtime
 from edge.detectors.plugins import load_detector
 from protocols.core.errors import InputError
 from tests.support.networks import constant_model, model_of, write_network
@@ -150,10 +149,10 @@ def test_external_data_beside_the_model_is_read_and_counted(tmp_path: Path, monk
     file = write_network(tmp_path, with_external("weights.bin"))
     assert load_detector(file).detect(np.zeros((48, 64, 3), np.uint8)) == []
     size = (tmp_path / "model.onnx").stat().st_size
-    monkeypatch.setattr(model_file, "MAX_BYTES", size + 999)
+    monkeypatch.setattr(runtime, "MAX_BYTES", size + 999)
     with pytest.raises(InputError, match="the model's data exceeds"):
         check_model_file(tmp_path / "model.onnx")
-    monkeypatch.setattr(model_file, "MAX_BYTES", size - 1)
+    monkeypatch.setattr(runtime, "MAX_BYTES", size - 1)
     with pytest.raises(InputError, match="at most"):
         check_model_file(tmp_path / "model.onnx")
 
