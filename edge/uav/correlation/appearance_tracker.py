@@ -125,7 +125,7 @@ class AppearanceTracker:
         self._parts.update(image, self._time, self.box, self.motion, place, origin)
         self._follow_first_motion(image)
         if not self._searching:
-            self._track(image, dt)
+            self._track(image, dt, origin)
         else:
             self._look_for(image, dt)
         return self._estimate(time)
@@ -229,8 +229,9 @@ class AppearanceTracker:
         self._motion_filter.restart(velocity, _FIRST_STD * self.length, self.length)
         self._sure = place, copy(self._motion_filter)
 
-    def _track(self, image: Image, dt: float) -> None:
-        """Measure the target about its prediction."""
+    def _track(self, image: Image, dt: float, origin: Floats) -> None:
+        """Measure the target about its prediction. origin: (2,) where its last place in the scene is now [px]."""
+        stood = origin if self.motion.trusted and self._missed == 0 else None
         if self.box.share_inside(self._size) < _MEASURE_INSIDE:
             self._searching = True  # it leaves the image
             self._miss(dt)
@@ -262,7 +263,7 @@ class AppearanceTracker:
             self._memory.confirm(score, self._belief.probability)
             self._filter.confirm(answer, self._belief.probability)
         if self._belief.visible:
-            self._accept(image, box, score, dt)
+            self._accept(image, box, score, dt, stood)
         else:
             self._searching = self._belief.gone or self._motion_filter.std > self.length
             self._miss(dt)
@@ -278,13 +279,13 @@ class AppearanceTracker:
         colour = _COLOUR_SHARE * self._colour.log_ratio(image, box)
         return box, score, self._memory.tracking_ratio(score) + answer.log_ratio + colour, answer
 
-    def _accept(self, image: Image, box: OrientedBox, score: float, dt: float) -> None:
+    def _accept(self, image: Image, box: OrientedBox, score: float, dt: float, stood: Floats | None) -> None:
         self._missed, self._unseen_s = 0, 0.0
         inside = box.share_inside(self._size)
         # Where it looks less like the target than what is beside it, it says little about how the target moves.
         unsure = 1.0 - inside if self._ratio > 0.0 else 1.0
         self._motion_filter.correct(box.centre - self.box.centre, self.length, unsure)
-        wider, higher, turn = self._flow.change(image, box.centre) if inside > _SIZE_INSIDE else (1.0, 1.0, 0.0)
+        wider, higher, turn = self._flow.change(image, box.centre, stood) if inside > _SIZE_INSIDE else (1.0, 1.0, 0.0)
         box = box.sized(box.sides * [wider, higher]).turned(turn)
         if inside > _LEARN_INSIDE:
             self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)

@@ -24,7 +24,7 @@ _PROPOSED, _MOST_PROPOSED = 2.5, 1.0  # log likelihood ratio of another tracker'
 _PROMISING = 0.0  # log odds of a place under test above which others are searched about the prediction only
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
 _MOST_TESTED, _RIVAL_MARGIN = 2, 2.0  # places that are tested at once; log odds within which one is a rival
-_OUTSIDE = 4.0  # log odds that a place must exceed, with the margin, while the target is surely beyond the border
+_UNSEARCHED = 4.0  # log odds that a place must exceed, with the margin, while the target is surely out of reach
 _MOST_MOVING = 2  # places at which something moves that are looked at, a search
 _DETECTION = 0.25  # probability that one search finds a target in view
 _HIDDEN = 0.1  # probability that it is in view, but behind something, for as long as it is away
@@ -98,9 +98,17 @@ class Redetection:
             return None
         best = self._tested[0]
         others = [c.log_odds for c in self._tested[1:]]
-        # While it is beyond the border, each search is another chance for what only looks like it.
-        least = max(0.0, _OUTSIDE * (1.0 - expected.box.probability_inside(expected.std, self._size)), *others)
+        least = max(0.0, _UNSEARCHED * self._unsearched(best, expected), *others)
         return best if best.accepted and best.log_odds > least + _MARGIN else None
+
+    def _unsearched(self, found: Candidate, expected: Prediction) -> float:
+        """Probability that the target is where it could not be found yet: each search is a chance for look-alikes.
+
+        It is beyond the border; or, of a place far from the prediction, near that and in view for too short a time.
+        """
+        beyond = 1.0 - expected.box.probability_inside(expected.std, self._size)
+        far = np.hypot(*(found.box.centre - expected.box.centre)) > 3.0 * expected.std + 0.5 * expected.motion.length
+        return max(beyond, self._near) if far else beyond
 
     def _search(self, image: Image, expected: Prediction, dt: float) -> None:
         """Take up the likeliest new place: in turn about the prediction, and in one tile after the other."""

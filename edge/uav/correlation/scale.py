@@ -20,6 +20,7 @@ _FLOW_PX = 72  # longer side of the resampled box [px]
 _FLOW_GRID = 7  # points a side
 _FLOW_MARGIN = 1.5  # of the resampled region, over the box
 _MIN_POINTS = 8  # of 49: of fewer, two wrong ones change the sides
+_TELLS_PX = 1.0  # shift of the target over the scene that its points' flow tells from none [px of the resampled box]
 _FLOW_PRIOR = 8.0  # points whose weight holds the size where the flow is weak
 _MAX_STEP = 1.12  # change of a side in one frame
 _MAX_TURN = 0.15  # in one frame [rad]
@@ -47,8 +48,11 @@ class BoxFlow:
         patch = crop(image, box.sized(sides / per_pixel), (int(sides[0]), int(sides[1])))
         return np.asarray(cv2.cvtColor(patch, cv2.COLOR_BGR2GRAY))
 
-    def change(self, image: Image, centre: Floats) -> tuple[float, float, float]:
-        """Factors of width and height, and turn [rad], since ``remember``. centre: (2,) of the target now [px]."""
+    def change(self, image: Image, centre: Floats, stood: Floats | None) -> tuple[float, float, float]:
+        """Factors of width and height, and turn [rad], since ``remember``.
+
+        centre: (2,) of the target now; stood: (2,) where it were if it stood in the scene, if known [px].
+        """
         none = (1.0, 1.0, 0.0)
         if self._old is None:
             return none
@@ -64,6 +68,11 @@ class BoxFlow:
         seen = centre + (points - middle) / per_pixel @ box.axes.T
         good &= ((seen >= 1.0) & (seen <= np.array(image.shape[1::-1]) - 2.0)).all(axis=1)
         p, q = points[good].astype(np.float64) - middle, moved[good].astype(np.float64) - middle
+        if stood is not None:
+            shift = (stood - centre) @ box.axes * per_pixel
+            if np.hypot(*shift) > _TELLS_PX:  # what moves as the scene does is background in the box
+                good = np.square(q - p - shift).sum(axis=1) > np.square(q - p).sum(axis=1)
+                p, q = p[good], q[good]
         if len(p) < _MIN_POINTS:
             return none
         near = np.abs(q - p - np.median(q - p, axis=0)).max(axis=1) < 0.08 * _FLOW_PX

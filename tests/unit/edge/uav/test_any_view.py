@@ -100,10 +100,28 @@ def test_flow_in_the_box_measures_growth_and_turn(scene: Image) -> None:
     later = np.asarray(cv2.warpAffine(image, matrix, (image.shape[1], image.shape[0])), np.uint8)
     flow = BoxFlow()
     flow.remember(image, box)
-    wider, higher, turn = flow.change(later, box.centre)
+    wider, higher, turn = flow.change(later, box.centre, None)
     assert wider == pytest.approx(1.04, abs=0.012)
     assert higher == pytest.approx(1.04, abs=0.012)
     assert turn == pytest.approx(np.deg2rad(2.0), abs=0.008)
+
+
+def test_what_stands_within_the_box_of_a_target_that_moves_says_nothing_of_its_size(scene: Image) -> None:
+    """A walker's box grew to twice its width over a tape on the ground behind him, of which it held a part."""
+    images, box, step = [], OrientedBox(500.0, 300.0, 60.0, 80.0), np.array([4.0, 0.0])
+    for k in range(2):
+        image = np.full_like(scene, 128)
+        image[:, 505:] = scene[:, 505:]  # texture behind its right half only
+        body = np.s_[272:329, round(485 + k * step[0]) : round(510 + k * step[0])]
+        image[body] = scene[72:129, 85:110]
+        images.append(image)
+    growth = []
+    for stood in (box.centre, None):
+        flow = BoxFlow()
+        flow.remember(images[0], box)
+        growth.append(flow.change(images[1], box.centre + step, stood)[0])
+    assert abs(growth[0] - 1.0) < 0.01
+    assert abs(growth[1] - 1.0) > 0.03
 
 
 def test_a_crop_of_a_turned_box_is_the_box_upright(scene: Image) -> None:

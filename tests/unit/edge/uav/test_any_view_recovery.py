@@ -102,6 +102,18 @@ def test_a_target_beyond_the_border_is_not_ruled_out_by_what_the_image_shows() -
     assert outside._near > 0.6
 
 
+def test_a_place_far_off_waits_until_the_prediction_was_in_view() -> None:
+    """Another person was taken in the frame in which the target came back into the picture where it was expected."""
+    search = redetection()
+    search._find_nothing(prediction(-40.0))
+    far, near = (Candidate(OrientedBox(x, 120.0, 30.0, 20.0), 0.0, prediction(60.0).motion) for x in (250.0, 62.0))
+    assert search._unsearched(far, prediction(60.0)) > 0.9
+    assert search._unsearched(near, prediction(60.0)) < 0.01
+    for _ in range(20):
+        search._find_nothing(prediction(60.0))
+    assert search._unsearched(far, prediction(60.0)) < 0.2
+
+
 def test_a_target_that_sets_off_while_away_is_likelier_near_than_anywhere() -> None:
     """Cars that wait at a light were searched for where they had stood only."""
     search = redetection()
