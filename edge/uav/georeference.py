@@ -57,7 +57,7 @@ class Georeference:
         self._lens = lens
         self._telemetry = TelemetryTrack(np.asarray(body_from_camera))
         self._centre: Floats | None = None
-        self._last_s = self._measured_s = -math.inf
+        self._measured_s = -math.inf
         self.offset: Floats | None = None
 
     def add(self, sample: Telemetry) -> None:
@@ -67,7 +67,6 @@ class Georeference:
     def reset(self) -> None:
         """Start over for another target, whose ground frame is new."""
         self.offset = self._centre = None
-        self._last_s = -math.inf
 
     def locate(self, x: float, y: float, time: float) -> Floats | None:
         """Ground position (2,) north, east [m] of the target at a pixel; None if not observable."""
@@ -88,10 +87,9 @@ class Georeference:
         place = np.array([estimate.north, estimate.east])
         if measured is not None:
             difference = measured - place
-            gain = 1.0 if self.offset is None else -math.expm1(-max(time - self._last_s, 0.0) / _TIME_CONSTANT_S)
+            gain = 1.0 if self.offset is None else -math.expm1(-max(time - self._measured_s, 0.0) / _TIME_CONSTANT_S)
             self.offset = difference if self.offset is None else self.offset + gain * (difference - self.offset)
             self._measured_s = time
-        self._last_s = time
         if self.offset is not None:
             place = place + self.offset
         centre = self._telemetry.position_at(time)

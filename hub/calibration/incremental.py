@@ -283,7 +283,6 @@ def _with_clock_steps(
         return prepared, _warm_start(prepared, _initial_states(prepared, last, tied, measured_lenses=full))
 
     prepared, reconstruction = start(steps, last)
-    before = steps, last, (prepared, reconstruction)
     for _ in range(MAX_CLOCK_STEPS + 1 if further else 0):
         found = _clock_step(steps, prepared, reconstruction)
         if found is None:
@@ -295,12 +294,10 @@ def _with_clock_steps(
         trial_steps, trial_last = with_step(steps, name, step), with_clock_set(last, name, step[1])
         trial = start(trial_steps, trial_last)
         supported = _supported_steps(trial_steps, *trial) if trial[1].names == reconstruction.names else None
-        if supported is None:
+        # Of two points with one label a step explains the few rows of the second; the others, rejected, do not speak.
+        if supported is None or not _explain_more(supported, trial[1], steps, reconstruction):
             break
         steps, last, (prepared, reconstruction) = supported, trial_last, trial
-    # Of two points with one label a step explains the few rows of the second one; the others, rejected, do not speak.
-    if reconstruction is not before[2][1] and not _explain_more(steps, reconstruction, before[0], before[2][1]):
-        steps, last, (prepared, reconstruction) = before
     return on_newest_clock(observations, steps), last, (prepared, reconstruction), steps
 
 

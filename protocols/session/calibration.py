@@ -121,9 +121,9 @@ class TrajectoryTable:
 class Calibration:
     """The complete calibration result that `calibrate` writes.
 
-    reference: camera whose clock is the reference. scale: "metric" or "arbitrary" (then the first camera is
-    the world and the first baseline is 1). refused: reasons by camera. cpu_seconds: of the solver.
-    residuals: per camera (n, 5): camera time, u, v, and the residual du, dv [px] of the rows used (inliers).
+    reference: camera on whose clock the reference is, or was until that was restarted. scale: "metric" or "arbitrary"
+    (then the first camera is the world and the first baseline is 1). refused: reasons by camera. cpu_seconds: of the
+    solver. residuals: per camera (n, 5): camera time, u, v, and the residual du, dv [px] of the rows used (inliers).
     convergence: the iterations of the last adjustment, in order. acceptance: tests by camera, refused ones included.
     """
 

@@ -255,10 +255,10 @@ def _nowhere(bodies: _Bodies, cameras: Sequence[CameraCalibration], height: floa
         pixel = camera.intrinsics.project(camera.pose.camera_from_world(place))
         inside = ((pixel > 0.0) & (pixel < [camera.intrinsics.width, camera.intrinsics.height])).all(axis=1)
         looked_at |= inside & near & ~mine
-    everybody = int(looked_at.sum())
+    everybody = int((looked_at & (distance * _LENGTH_STD < _MAX_ERROR)).sum())
     looked_at &= known
     count, met = int(looked_at.sum()), int((_met(bodies, height) & looked_at).sum())
-    # Where hardly anybody can be placed, as below cameras at 12 m, the few are false boxes.
+    # Where hardly anybody can be placed for the steep view, as below cameras at 12 m, the few are false boxes.
     if count < max(_MIN_LOOKED_AT, _MIN_SHARE * everybody) or met >= _MIN_MET * count:
         return ()
     small = {share: int((_met(bodies, share * height) & looked_at).sum()) for share in _SMALL}

@@ -141,7 +141,7 @@ class BoardDetector:
         kernel = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
         resized = part if scale == 1.0 else np.asarray(cv2.resize(part, size, interpolation=kernel), dtype=np.uint8)
         cut = x == 0 or y == 0 or right == grey.shape[1] or bottom == grey.shape[0]
-        numbers, pixels = self._finder.find(resized, thorough=thorough, cut=cut)
+        numbers, pixels = self._finder.find(resized, thorough=thorough, cut=cut, rough=scale < 1.0)
         full = (pixels + 0.5) * [part.shape[1] / size[0], part.shape[0] / size[1]] - 0.5
         if scale < 1.0:
             numbers, full = self._finder.refine(part, (numbers, full))

@@ -45,10 +45,11 @@ class Finder:
         self._charuco = _charuco_detector(board) if board.kind == "charuco" else None
         self._tags = _tag_detector(board) if board.tags else None
 
-    def find(self, grey: Grey, *, thorough: bool = False, cut: bool = False) -> Corners:
+    def find(self, grey: Grey, *, thorough: bool = False, cut: bool = False, rough: bool = False) -> Corners:
         """The corners in an image (H, W) uint8.
 
-        thorough: search a chessboard by every method. cut: it may go on beyond the image's border.
+        thorough: search a chessboard by every method. cut: it may go on beyond the image's border. rough: `refine`
+        follows, so the sides of tags are not measured yet.
         """
         if min(grey.shape) < 24:
             return NOTHING
@@ -59,6 +60,7 @@ class Finder:
             numbers, pixels = self._find_charuco(print_)
         elif self._tags is not None:
             numbers, pixels = self._find_tags(print_)
+            pixels = pixels if rough else self._measured(print_, pixels)
         else:
             numbers, pixels = self._find_chessboard(print_, False)
             if cut and not len(numbers) and not self.board.symmetric:
@@ -75,8 +77,6 @@ class Finder:
         numbers, pixels = corners
         if not len(numbers):
             return corners
-        if self.board.tags:
-            return numbers, np.concatenate([refined_corners(grey, quad) for quad in pixels.reshape(-1, 4, 2)])
         share = _SUBPIX_SHARE if self.board.kind == "chessboard" else _SUBPIX_SHARE_OF_TAGS
         half = int(np.clip(share * self.pitch(corners), _SUBPIX_LEAST, _SUBPIX_MOST))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
@@ -85,7 +85,14 @@ class Finder:
         found = cv2.cornerSubPix(grey, begin, (half, half), (-1, -1), criteria)
         refined = np.asarray(found, dtype=np.float64).reshape(-1, 2)
         moved = np.linalg.norm(refined - pixels, axis=1) < 1.5 * half
-        return numbers, np.where(moved[:, None], refined, pixels)
+        refined = np.where(moved[:, None], refined, pixels)
+        return numbers, self._measured(np.asarray(255 - grey if self.board.inverted else grey, np.uint8), refined)
+
+    def _measured(self, print_: Grey, pixels: Floats) -> Floats:
+        """Corners (n, 2) of tags, four each, where lines along their sides meet; those of other boards as they are."""
+        if not self.board.tags or not len(pixels):
+            return pixels
+        return np.concatenate([refined_corners(print_, quad) for quad in pixels.reshape(-1, 4, 2)])
 
     def pitch(self, corners: Corners) -> float:
         """Median distance of a corner from the nearest other one [px]."""
@@ -118,7 +125,7 @@ class Finder:
             if self.board.squares is not None and labels[0] not in self._numbers:
                 continue  # not of this grid
             numbers += [self._number(label) for label in labels]
-            pixels.append(refined_corners(grey, np.asarray(quad, dtype=np.float64).reshape(4, 2)))
+            pixels.append(np.asarray(quad, dtype=np.float64).reshape(4, 2))
         return (np.array(numbers, dtype=np.int64), np.concatenate(pixels)) if numbers else NOTHING
 
     def _find_chessboard(self, grey: Grey, thorough: bool) -> Corners:

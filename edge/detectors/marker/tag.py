@@ -32,6 +32,7 @@ _REACH = 0.07  # over the tag's size, on both sides of its border: beyond the mi
 _STEP = 0.5  # px across a side
 _LEAST_CONTRAST = 20.0  # grey levels between the border and the margin
 _MIN_SIDE = 8.0  # px
+_BENT_PX = 1.0  # middle of a side off its chord, from which a parabola misses the corners by as much as ArUco does
 _MAX_SCATTER = 0.12  # over the side: largest scatter about its line
 _FLOOR_PX = 0.004  # px: std of the centre without noise,
 _FLOOR_SIDE = 0.3  # plus this [px²] over the side: of a small tag neither black nor white is seen pure,
@@ -85,7 +86,7 @@ class TagDetector:
         sides = _measure_sides(grey, quad)
         if sides is None:
             return None
-        lines, covariances, contrast, scatter, width, blur_std = sides
+        lines, covariances, contrast, scatter, width, blur_std, *_ = sides
         corners = _corners(lines)
         if corners is None or _far(corners, quad):
             return None
@@ -109,12 +110,13 @@ class TagDetector:
 
 
 def refined_corners(grey: npt.NDArray[np.uint8], quad: Floats) -> Floats:
-    """The corners (4, 2) [px] where lines along a tag's four sides meet; ``quad`` where a side cannot be measured.
+    """The corners (4, 2) [px] where a tag's four sides meet; ``quad`` where these cannot be measured.
 
     ArUco's own are 0.2 to 0.3 px inside the tag, as smoothing rounds a corner off: sides of 20 px are 2 % too short.
+    Sides are parabolas, for the lens bends them; those that it bends more are not.
     """
     sides = _measure_sides(grey, quad)
-    corners = None if sides is None else _corners(sides[0])
+    corners = None if sides is None or sides[-1] > _BENT_PX else _corners(*sides[-2])
     return quad if corners is None or _far(corners, quad) else corners
 
 
@@ -135,12 +137,13 @@ def _detector(name: str) -> Any:
 
 def _measure_sides(
     grey: npt.NDArray[np.uint8], quad: Floats
-) -> tuple[Floats, Floats, float, float, float, float] | None:
+) -> tuple[Floats, Floats, float, float, float, float, tuple[Floats, Floats], float] | None:
     """Lines of the four sides, their covariances, contrast and scatter; None where a side cannot be measured.
 
     lines: (4, 2, 2): a point on each and its unit direction. covariances: (4, 2, 2) of the offset at that point [px²]
-    and of the angle [rad²]. contrast: of the weakest side. scatter: of the worst, in px. The last two are the width of
-    the widest border and the std caused by a border smeared over a whole cell, in px.
+    and of the angle [rad²]. contrast: of the weakest side. scatter: of the worst, in px. Then come the width of
+    the widest border and the std caused by a border smeared over a whole cell, in px; the tangents at the end and at
+    the start of each side, as lines; and how far the middle of the most bent one lies off its chord, in px.
     """
     lines = np.zeros((4, 2, 2))
     covariances = np.zeros((4, 2, 2))
@@ -149,7 +152,8 @@ def _measure_sides(
     for _ in range(_PASSES):
         middle = corners.mean(axis=0)
         contrast, worst, widest, blur_std = np.inf, 0.0, 0.0, 0.0
-        contrasts, halves = np.zeros(4), np.zeros(4)
+        contrasts, halves, bends = np.zeros(4), np.zeros(4), np.zeros(4)
+        tangents = np.zeros((4, 2, 2)), np.zeros((4, 2, 2))
         for index in range(4):
             start, end = corners[index], corners[(index + 1) % 4]
             length = float(np.linalg.norm(end - start))
@@ -171,6 +175,13 @@ def _measure_sides(
             full = max(width / (2.0 * half) - _PROFILE_FILL, 0.0) / _PROFILE_FILL_STEP
             blur_std = max(blur_std, _FLOOR_FULL * full * max(width - _SHARP, 0.0))
             line, covariance, scatter = _fit_line(places, offset, length / count)
+            curve, _, _ = _fit_line(places / (0.5 * length), offset, length / count, 2)
+            bends[index] = abs(curve[2])
+            for x, ends in zip((1.0, -1.0), tangents, strict=True):
+                ends[index] = (
+                    point + 0.5 * x * length * along + (curve @ [1.0, x, 1.0]) * outward,
+                    along + 2.0 / length * (curve[1] + 2.0 * curve[2] * x) * outward,
+                )
             contrasts[index], halves[index] = weakest, half
             contrast, worst, widest = min(contrast, weakest), max(worst, scatter), max(widest, width)
             lines[index] = point + line[0] * outward, along + line[1] * outward
@@ -182,7 +193,9 @@ def _measure_sides(
         corners = found
     contrast_std = _FLOOR_CONTRAST * float((halves * (1.0 - contrasts / contrasts.max())).max())
     blur_std = float(np.hypot(blur_std, contrast_std))
-    return (lines, covariances, contrast, worst, widest, blur_std) if contrast >= _LEAST_CONTRAST else None
+    if contrast < _LEAST_CONTRAST:
+        return None
+    return lines, covariances, contrast, worst, widest, blur_std, tangents, float(bends.max())
 
 
 def _edge_offsets(
@@ -213,17 +226,22 @@ def _edge_offsets(
     return share @ weight - half, float(light - dark), 6.0 * float(np.median(mixed))
 
 
-def _fit_line(places: Floats, offset: Floats, spacing: float) -> tuple[Floats, Floats, float]:
-    """Robust line (offset, slope) through offsets (n,) at places (n,), its covariance (2, 2), the scatter [px]."""
-    design = np.column_stack([np.ones_like(places), places])
+def _fit_line(places: Floats, offset: Floats, spacing: float, degree: int = 1) -> tuple[Floats, Floats, float]:
+    """Robust line (offset, slope) through offsets (n,) at places (n,), its covariance (2, 2), the scatter [px].
+
+    degree: 2 for a parabola, of three coefficients.
+    """
+    design = np.vander(places, degree + 1, increasing=True)
     weight = np.ones_like(places)
-    line: Floats = np.zeros(2)
+    line: Floats = np.zeros(degree + 1)
     scatter = 0.0
     for _ in range(4):
         weighted = design * weight[:, None]
         line = np.asarray(np.linalg.solve(weighted.T @ design, weighted.T @ offset), dtype=np.float64)
         residual = offset - design @ line
-        scatter = 1.4826 * float(np.median(np.abs(residual))) * np.sqrt(len(places) / (len(places) - 2.0)) + 1e-3
+        scatter = (
+            1.4826 * float(np.median(np.abs(residual))) * np.sqrt(len(places) / (len(places) - 1.0 - degree)) + 1e-3
+        )
         weight = 1.0 / (1.0 + (residual / (2.5 * scatter)) ** 2) ** 2
     correlated_samples = max(1.0, _CORRELATION_PX / spacing)
     information = (design * weight[:, None]).T @ design
@@ -231,11 +249,14 @@ def _fit_line(places: Floats, offset: Floats, spacing: float) -> tuple[Floats, F
     return line, covariance, scatter
 
 
-def _corners(lines: Floats) -> Floats | None:
-    """Corners (4, 2), the intersections of each side with the one before it; None where two are parallel."""
+def _corners(lines: Floats, starts: Floats | None = None) -> Floats | None:
+    """Corners (4, 2), the intersections of each side with the one before it; None where two are parallel.
+
+    starts: lines of the sides at their starts, where ``lines`` are those at their ends.
+    """
     corners = np.zeros((4, 2))
     for index in range(4):
-        (p, d), (q, e) = lines[index - 1], lines[index]
+        (p, d), (q, e) = lines[index - 1], (lines if starts is None else starts)[index]
         across = d[0] * e[1] - d[1] * e[0]
         if abs(across) < 0.05:
             return None

@@ -37,7 +37,7 @@ class LocalFrame:
         self.position: tuple[float, Floats, Floats] | None = None
         self._shift = np.zeros(3)  # from reported local positions into this frame
         self._local_s: float | None = None
-        self._interval_s = MAX_POSITION_AGE_S  # between the last two reports
+        self._interval_s = MAX_POSITION_AGE_S  # between reports, as a moving mean
         self._armed_s: float | None = None
 
     def set_armed(self, armed: bool, time: float) -> None:
@@ -97,7 +97,8 @@ class LocalFrame:
             self._correct(position - local[0], 0.0)
 
     def _report(self, time: float, position: Floats, velocity: Floats) -> None:
-        self._interval_s = MAX_POSITION_AGE_S if self.position is None else time - self.position[0]
+        if self.position is not None:
+            self._interval_s += 0.3 * (min(time - self.position[0], MAX_POSITION_AGE_S) - self._interval_s)
         self.position = time, position, velocity
 
     def _correct(self, lacking: Floats, slack_m: float, *, across: bool = True) -> None:

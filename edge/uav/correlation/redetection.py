@@ -104,11 +104,12 @@ class Redetection:
     def _unsearched(self, found: Candidate, expected: Prediction) -> float:
         """Probability that the target is where it could not be found yet: each search is a chance for look-alikes.
 
-        It is beyond the border; or, of a place far from the prediction, near that and in view for too short a time.
+        It is beyond the border; or it is nearer the prediction than the place, and was in view for too short a time.
         """
         beyond = 1.0 - expected.box.probability_inside(expected.std, self._size)
-        far = np.hypot(*(found.box.centre - expected.box.centre)) > 3.0 * expected.std + 0.5 * expected.motion.length
-        return max(beyond, self._near) if far else beyond
+        squared = float(np.square(found.box.centre - expected.box.centre).sum())
+        nearer = 1.0 - 1.0 / (1.0 + 0.5 * squared / expected.std**2)  # of the distribution of `_log_density`
+        return max(beyond, self._near * nearer)
 
     def _search(self, image: Image, expected: Prediction, dt: float) -> None:
         """Take up the likeliest new place: in turn about the prediction, and in one tile after the other."""

@@ -20,7 +20,6 @@ _FLOW_PX = 72  # longer side of the resampled box [px]
 _FLOW_GRID = 7  # points a side
 _FLOW_MARGIN = 1.5  # of the resampled region, over the box
 _MIN_POINTS = 8  # of 49: of fewer, two wrong ones change the sides
-_TELLS_PX = 1.0  # shift of the target over the scene that its points' flow tells from none [px of the resampled box]
 _FLOW_PRIOR = 8.0  # points whose weight holds the size where the flow is weak
 _MAX_STEP = 1.12  # change of a side in one frame
 _MAX_TURN = 0.15  # in one frame [rad]
@@ -70,7 +69,8 @@ class BoxFlow:
         p, q = points[good].astype(np.float64) - middle, moved[good].astype(np.float64) - middle
         if stood is not None:
             shift = (stood - centre) @ box.axes * per_pixel
-            if np.hypot(*shift) > _TELLS_PX:  # what moves as the scene does is background in the box
+            # More than a pixel here, and half of one in the image, tells: what moves as the scene does is background.
+            if np.hypot(*shift) > max(1.0, 0.5 * per_pixel):
                 good = np.square(q - p - shift).sum(axis=1) > np.square(q - p).sum(axis=1)
                 p, q = p[good], q[good]
         if len(p) < _MIN_POINTS:

@@ -19,7 +19,7 @@ from protocols.geometry.types import Floats
 _LOG_SIZE_PSD = 1e-4  # 1/s: the size may drift by 1 % in a second, 8 % in a minute
 _WALKING_M_S, _STANDING_SHARE = 0.4, 0.05
 """Turning and swaying grow with speed: somebody who stands has this share of a walker's acceleration (variance)."""
-_RUNNING_M_S = 2.0  # where walking becomes running (Hreljac 1993: 2.07 m/s); from there they grow on
+_RUNNING_M_S, _SPRINT_M_S = 2.0, 7.0  # from walking becoming running (Hreljac 1993: 2.07 m/s) to sprints they grow on
 _ACCELERATION_PSD, _VELOCITY_PSD = np.array([(model.acceleration_psd, model.velocity_psd) for model in TARGET_MODELS]).T
 
 
@@ -29,7 +29,8 @@ def predict_targets(targets: Targets, elapsed: Floats | float, parameters: Track
         return targets
     units_per_m = units_of(targets, parameters.scale.units_per_m)
     speed = np.linalg.norm(targets.mean[:, VELOCITY], axis=1) / units_per_m
-    share = np.clip((speed / _WALKING_M_S) ** 2, _STANDING_SHARE, np.maximum((speed / _RUNNING_M_S) ** 2, 1.0))
+    most = np.clip(speed / _RUNNING_M_S, 1.0, _SPRINT_M_S / _RUNNING_M_S) ** 2
+    share = np.clip((speed / _WALKING_M_S) ** 2, _STANDING_SHARE, most)
     share = np.where(UPRIGHT[targets.kind], share, 1.0)
     acceleration_psd, velocity_psd = (
         psd[targets.kind] * units_per_m**2 * share for psd in (_ACCELERATION_PSD, _VELOCITY_PSD)
