@@ -191,6 +191,10 @@ def test_calibration_toml_from_the_bus_equals_the_published_calibration(tmp_path
     state = ViewState()
     assert calibration_file(state) == ""
     message = calibration()
+    reference = message.cameras.add()
+    reference.CopyFrom(message.cameras[0])
+    reference.camera, reference.time_offset, reference.clock_rate = "cam1", 0.0, 1.0
+    message.reference_camera = "cam1"
     for found in message.cameras:
         state.handle(camera_info(found.camera), 0.0)
     state.handle(message, 0.0)
