@@ -12,6 +12,10 @@ from enum import Enum
 
 from protocols.core.names import check_identifier, key_segment
 
+OUTAGE_S = 60.0
+"""The longest link outage without message loss, unless configured otherwise."""
+_MARGIN = 1.5  # rates vary, and an outage is noticed late
+
 
 class Delivery(Enum):
     """Delivery guarantee of a topic when the link or the receiver is slow or disconnected."""
@@ -95,11 +99,6 @@ def liveliness_key(site: str, role: str, agent: str, boot_id: str) -> str:
         f"syncline/{check_identifier(site, 'site')}/alive/{check_identifier(role, 'role')}/{key_segment(agent)}/"
         f"{check_identifier(boot_id, 'boot id')}"
     )
-
-
-OUTAGE_S = 60.0
-"""The longest link outage without message loss, unless configured otherwise."""
-_MARGIN = 1.5  # rates vary, and an outage is noticed late
 
 
 def cache_size(topic: Topic, rate_hz: float | None = None, outage_s: float = OUTAGE_S) -> int:

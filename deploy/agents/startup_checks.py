@@ -19,6 +19,14 @@ from protocols.messages import syncline_pb2 as pb
 _ROLES: dict[type, str] = {CameraConfig: "camera", HubConfig: "hub", RecorderConfig: "record", RouterConfig: "router"}
 _RENEW_DAYS = 3.0  # a tenth of the default validity of 30 days
 
+_CERTIFICATE_S = 30.0
+"""Between two readings of the certificate, which may be renewed."""
+_CLOCK_STEP_S = 2.0
+"""A change of Unix time against the monotonic clock by more is a step: time services slew what is less."""
+_CLOCK_STEP_NOTICE_S = 60.0  # for so long a status names the step: long enough for a person to see it
+_MAX_TEXT = 2000  # characters of a status message
+_EXPIRY = "certificate_expiry_timestamp_s"
+
 
 def role_of(settings: Any) -> str:
     """The role of an agent's configuration, as named in its certificate."""
@@ -48,15 +56,6 @@ def serve_health(settings: Any, health: Health) -> AbstractContextManager[object
 
 def _warn(text: str) -> None:
     print(f"syncline: {text}", file=sys.stderr, flush=True)
-
-
-_CERTIFICATE_S = 30.0
-"""Between two readings of the certificate, which may be renewed."""
-_CLOCK_STEP_S = 2.0
-"""A change of Unix time against the monotonic clock by more is a step: time services slew what is less."""
-_CLOCK_STEP_NOTICE_S = 60.0  # for so long a status names the step: long enough for a person to see it
-_MAX_TEXT = 2000  # characters of a status message
-_EXPIRY = "certificate_expiry_timestamp_s"
 
 
 class Conditions:

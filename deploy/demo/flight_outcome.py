@@ -35,6 +35,10 @@ LOG, REPORT = "demo.mcap", "report.html"
 _MAX_IMAGE_ERROR_PX = 20.0  # as NEAR_PX of deploy.evaluation.track_scores
 _MIN_GEO_TOLERANCE_M = 5.0  # about a car's length: for accuracies that are stated as less
 
+_COLOURS = {"visible": "#1d6b3a", "coasting": "#c2510a"}
+_MAP_PX, _MARGIN_PX = (900.0, 560.0), 40.0  # size of the map, and of the room around the paths
+_MIN_MAP_SPAN_M = 3.0  # smallest extent of the map
+
 
 @dataclass(frozen=True, slots=True)
 class FlightOutcome:
@@ -190,11 +194,6 @@ def _share(good: Any) -> float | None:
 def _median(values: Any) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else None
-
-
-_COLOURS = {"visible": "#1d6b3a", "coasting": "#c2510a"}
-_MAP_PX, _MARGIN_PX = (900.0, 560.0), 40.0  # size of the map, and of the room around the paths
-_MIN_MAP_SPAN_M = 3.0  # smallest extent of the map
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,6 +39,13 @@ _POSITION = ("north", "east", "down")
 _GEODETIC = ("lat", "lon", "alt", "latitude", "longitude", "altitude")
 _TELEMETRY_LOOKAHEAD_S = 0.6  # lead with which samples are passed to the tracker: clocks may differ by 0.5 s
 
+_MARGIN = 0.5  # fraction of the image size added on each side
+_MAX_CANVAS_PX = 1280  # side of the overlay's picture: fits a screen
+_COLOURS = {TrackState.VISIBLE: (80, 220, 80), TrackState.COASTING: (40, 170, 255), TrackState.LOST: (60, 60, 230)}
+_LAYERS = {"road": (110, 80, 30), "tracks": (160, 160, 160)}
+_OTHER_LAYER = (0, 220, 220)  # BGR
+_PARTICLE = (230, 120, 230)  # BGR
+
 
 class FrameSource(Protocol):
     """An opened recording of images."""
@@ -263,14 +270,6 @@ def hypotheses_text(rows: Sequence[TrackedFrame]) -> str:
 
 def _cell(value: float) -> str:
     return f"{value:.17g}" if math.isfinite(value) else ""
-
-
-_MARGIN = 0.5  # fraction of the image size added on each side
-_MAX_CANVAS_PX = 1280  # side of the overlay's picture: fits a screen
-_COLOURS = {TrackState.VISIBLE: (80, 220, 80), TrackState.COASTING: (40, 170, 255), TrackState.LOST: (60, 60, 230)}
-_LAYERS = {"road": (110, 80, 30), "tracks": (160, 160, 160)}
-_OTHER_LAYER = (0, 220, 220)  # BGR
-_PARTICLE = (230, 120, 230)  # BGR
 
 
 def draw(image: Image, tracked: TrackedFrame) -> Image:

@@ -31,6 +31,8 @@ _MIN_FRAMES = 5  # of a track: fewer are flicker
 MAX_MOVING_SHARE = 0.3
 """Share of the time: where a camera moves for longer, people are not detected."""
 
+_HUES = 12  # that the eye can tell apart
+
 
 def moving_detector(what: str, model: SubtractorName, fps: float) -> MovingDetector:
     """A detector that also reports tentative tracks: in a recording they are confirmed or dropped at the end."""
@@ -142,9 +144,6 @@ def _stationary_labels(collected: Collected) -> set[str]:
         if len(ones) < _MIN_FRAMES or displacement < length:
             stationary.add(label)
     return stationary
-
-
-_HUES = 12  # that the eye can tell apart
 
 
 def write_overlay(video: VideoReader, out: Path, found: Mapping[int, Sequence[tuple[str, Detection]]]) -> None:

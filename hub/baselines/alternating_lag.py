@@ -25,6 +25,10 @@ from protocols.session.observations import Track
 _TOLERANCE = 1e-6  # relative decrease of E below which the iteration has converged (eq. 22)
 _MAX_ITERATIONS = 60  # bounds the alternation
 
+_SAME_RATE = 0.01  # relative difference of frame intervals up to which frame rates count as equal
+_CONVERGED_PX = 5.0  # mean epipolar distance above which the iteration has not converged
+_MAX_FRAMES = 200_000  # frames
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Iteration:
@@ -141,11 +145,6 @@ def corresponding_points(a: Floats, b: Floats, lag: float) -> tuple[Floats, Floa
 def _mean_line_distance(fundamental: Floats, a: Floats, b: Floats) -> float:
     """E (eq. 21): mean distance of b's points from the epipolar lines of a's [px]."""
     return float(np.abs(line_distances(epipolar_lines(fundamental, a), b)).mean())
-
-
-_SAME_RATE = 0.01  # relative difference of frame intervals up to which frame rates count as equal
-_CONVERGED_PX = 5.0  # mean epipolar distance above which the iteration has not converged
-_MAX_FRAMES = 200_000  # frames
 
 
 def solve_pair_by_paper(

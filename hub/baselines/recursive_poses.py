@@ -28,6 +28,14 @@ from protocols.session.rig import Rig
 MIN_OBSERVATIONS = 4
 """Shared observations before an edge is used."""
 
+_UPDATE_INTERVAL = 10
+"""Observations between two updates."""
+_INITIAL_OBSERVATIONS = 200
+"""Shared observations from which an initial pose is computed."""
+_MIN_OBSERVATIONS = 12  # of a camera: twice the unknowns of its pose
+_BASELINE = 250.0
+"""Distance of the first two cameras in the unit of the method's constants (cm, as in the paper's section 4)."""
+
 
 @dataclass(frozen=True, slots=True)
 class RecursivePoseSettings:
@@ -185,14 +193,6 @@ class RecursivePoseNode:
                 self.position, self.covariance, poses[k][0].position, poses[k][1], h, self.settings
             )
 
-
-_UPDATE_INTERVAL = 10
-"""Observations between two updates."""
-_INITIAL_OBSERVATIONS = 200
-"""Shared observations from which an initial pose is computed."""
-_MIN_OBSERVATIONS = 12  # of a camera: twice the unknowns of its pose
-_BASELINE = 250.0
-"""Distance of the first two cameras in the unit of the method's constants (cm, as in the paper's section 4)."""
 
 SharedPair = tuple[int, int, Floats]
 

@@ -21,6 +21,12 @@ _MAX_STD_RATIO = 10.0
 """Ratio of a row's stated std to the camera's median beyond which it is not believed: lens errors are no smaller."""
 NO_INTRINSICS = "no intrinsics (matrix and distortions in rig.toml): run `syncline intrinsics`"
 
+CELL_PX = 6.0  # about a fixed pixel: three sigma of a poor detector
+_JUMP_PX = 60.0  # between rows is a jump if longer; a target that leaves a place of rest is seen nearer, above 3 fps
+_CELL_SHARE = CELL_PX / _JUMP_PX  # of a target's rows within a jump of a pixel that it passes: its path is a line there
+_RUN = 3  # rows without a jump are a target in motion: of 30 % false rows all over the image, one in 10^4 begins one
+_FALSE_ALARM = 1e-4  # of a track
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedSession:
@@ -226,18 +232,11 @@ def nominal_intrinsics(camera: RigCamera) -> Intrinsics:
     return Intrinsics(width, height, matrix)
 
 
-CELL_PX = 6.0  # about a fixed pixel: three sigma of a poor detector
-_JUMP_PX = 60.0  # between rows is a jump if longer; a target that leaves a place of rest is seen nearer, above 3 fps
-_CELL_SHARE = CELL_PX / _JUMP_PX  # of a target's rows within a jump of a pixel that it passes: its path is a line there
-_RUN = 3  # rows without a jump are a target in motion: of 30 % false rows all over the image, one in 10^4 begins one
-_FALSE_ALARM = 1e-4  # of a track
-
-
 def static_clutter(x: Floats) -> Floats | None:
     """The pixel (2,) of rows (n, 2) [px], by time, with most jumps to it, if it is clutter and no target.
 
     A target arrives at a pixel, rests and leaves through its neighbourhood; one that is too fast for the camera to show
-    that is as often beside it as its size tells, and one on a closed path comes from the same place each time. So the
+    that is as often beside it as its size says, and one on a closed path comes from the same place each time. So the
     different places of a moving target before jumps to the pixel, and all jumps to beside it, have binomial odds.
     """
     begins = np.flatnonzero(np.r_[True, np.hypot(*(x[1:] - x[:-1]).T) > _JUMP_PX])

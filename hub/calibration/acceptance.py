@@ -45,6 +45,12 @@ CameraTests = dict[str, list[AcceptanceTest]]
 Failure = tuple[str, AcceptanceTest]
 """A camera, and the test that it fails."""
 
+_MAX_VARIATION = 0.04
+"""Of the distance from head to foot, relative, as a robust std. Of one walker in five rendered rooms it is 0.008 to
+0.010 where rotations are right to 1.1 degrees, 0.023 with lenses 6 % off, and 0.052 and 0.063 where they are 9 to 20
+degrees off; of points with 2 px of noise 0.002 to 0.006."""
+_MIN_PLACES = 30  # a robust std of fewer is off by more than an eighth
+
 
 def misfits(reconstruction: Reconstruction, unknown_lenses: Iterable[str] = ()) -> list[Failure]:
     """The cameras that do not fit the trajectory that the others give, the worst one first.
@@ -253,13 +259,6 @@ def _lag_conflicts(reconstruction: Reconstruction, pairs: Iterable[PairSolution]
         source = "twice the largest std that a pair's lag may have"
         out[pair.b] = [AcceptanceTest(LAG_CONFLICT, difference, _MAX_LAG_CHANGE, "s", source, reason)]
     return out
-
-
-_MAX_VARIATION = 0.04
-"""Of the distance from head to foot, relative, as a robust std. Of one walker in five rendered rooms it is 0.008 to
-0.010 where rotations are right to 1.1 degrees, 0.023 with lenses 6 % off, and 0.052 and 0.063 where they are 9 to 20
-degrees off; of points with 2 px of noise 0.002 to 0.006."""
-_MIN_PLACES = 30  # a robust std of fewer is off by more than an eighth
 
 
 def check_stature(trajectories: Iterable[TrajectoryTable]) -> None:

@@ -25,6 +25,14 @@ from protocols.session.rig import Rig
 _LENS_STD = 0.01
 """Relative std of a measured focal length for which no std is given: as `--refine-lenses` allows for."""
 
+_SAMPLING_STEP = 0.05  # s between samples
+_MIN_SAMPLES = 10  # of a bar's length
+_MAX_LENGTH_SPREAD = 0.2  # relative robust spread of the length; more means that it is not rigid
+_CORRELATION_TIME = 0.25  # s between samples with independent errors
+_MIN_STD = 1e-4  # relative: lower bound of the std
+_MAX_CONFLICT_SIGMAS = 5.0  # once in 1.7 million by chance
+_GIVEN_LENGTH_STD, _MAX_DISAGREEMENT = 2e-3, 0.02  # relative: 1 mm in half a metre of a tape measure; ten times that
+
 
 def refuted_lens(test: ScoreTest) -> str:
     """What the observations say about a measured lens."""
@@ -111,15 +119,6 @@ def _effect(given: str, std: float, change: Floats, names: list[str], problem: P
     lags = by_camera[:, Column.OFFSET] - by_camera[problem.clock_reference, Column.OFFSET]
     farthest = int(np.argmax(moved))
     return Sensitivity(given, std, float(moved[farthest]), names[farthest], float(np.abs(lags).max()))
-
-
-_SAMPLING_STEP = 0.05  # s between samples
-_MIN_SAMPLES = 10  # of a bar's length
-_MAX_LENGTH_SPREAD = 0.2  # relative robust spread of the length; more means that it is not rigid
-_CORRELATION_TIME = 0.25  # s between samples with independent errors
-_MIN_STD = 1e-4  # relative: lower bound of the std
-_MAX_CONFLICT_SIGMAS = 5.0  # once in 1.7 million by chance
-_GIVEN_LENGTH_STD, _MAX_DISAGREEMENT = 2e-3, 0.02  # relative: 1 mm in half a metre of a tape measure; ten times that
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,14 @@ _TEST_SIGMAS = 3.0  # 0.3 % by chance
 _MAX_PRIORS = 1024
 """Cameras; as many as a hub has."""
 
+_INTERVAL_S = 2.0  # s: holds a frame with the smallest delay
+_INTERVALS = 15  # half a minute
+_MIN_INTERVALS = 3  # complete ones, whose spread is tested
+_MAX_SPREAD_S = 0.1
+"""Largest difference of the intervals' smallest delays."""
+ERROR_BOUND_S = 0.15
+"""Of one camera's offset: its smallest delay is 0 to 0.3 s."""
+
 
 @dataclass(frozen=True, slots=True)
 class ExternalClockPrior:
@@ -112,15 +120,6 @@ def _format_seconds(seconds: float) -> str:
         if seconds * factor >= 1.0:
             return f"{seconds * factor:.3g} {unit}"
     return f"{seconds * 1e6:.2g} µs"
-
-
-_INTERVAL_S = 2.0  # s: holds a frame with the smallest delay
-_INTERVALS = 15  # half a minute
-_MIN_INTERVALS = 3  # complete ones, whose spread is tested
-_MAX_SPREAD_S = 0.1
-"""Largest difference of the intervals' smallest delays."""
-ERROR_BOUND_S = 0.15
-"""Of one camera's offset: its smallest delay is 0 to 0.3 s."""
 
 
 class ArrivalPriors:

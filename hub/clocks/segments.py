@@ -28,6 +28,10 @@ _MAX_ALARMS = 32  # a status has room for as many
 _MAX_CHANGES = 64
 """Changes of one camera's clock; who has more has no clock, and is no longer watched."""
 
+_SECOND_NS = 1_000_000_000  # ns
+_TIME_TOLERANCE_S = 1e-5
+"""More than rounding, less than a frame interval."""
+
 
 class ClockSegments:
     """Applies the clock change detector to observations before they reach the solver."""
@@ -101,11 +105,6 @@ class ClockSegments:
         """Rate of the hub's clock relative to each camera's over the last seconds, less 1 [ppm]."""
         rates = {camera: self._detector.relative_rate(camera, boot) for camera, boot in self._runs.items()}
         return {camera: 1e6 * rate for camera, rate in rates.items() if rate is not None}
-
-
-_SECOND_NS = 1_000_000_000  # ns
-_TIME_TOLERANCE_S = 1e-5
-"""More than rounding, less than a frame interval."""
 
 
 @dataclass(frozen=True, slots=True)

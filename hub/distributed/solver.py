@@ -46,6 +46,10 @@ _ROUNDS = 2
 ProgressCallback = Callable[[str, float], None]
 
 
+_MAX_JOINING_UPDATES = 150
+"""Updates within which cameras must join a common frame."""
+
+
 class DistributedPoseSolver:
     """Estimates the poses of a clock graph's cameras by pose nodes. warnings: notices of the last run."""
 
@@ -225,10 +229,6 @@ def node_calibration(rig: Rig, nodes: NodeHost | None) -> Calibration:
         refused=refused,
         warnings=rejected + gauge.warnings,
     )
-
-
-_MAX_JOINING_UPDATES = 150
-"""Updates within which cameras must join a common frame."""
 
 
 class InProcessNetwork:

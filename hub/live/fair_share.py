@@ -20,6 +20,13 @@ _MAX_WAITING_ROWS, _MAX_WAITING_IN_ALL = 40_000, 100_000
 most of them where all together have too many."""
 _LEAST_SHARE_S = 0.01  # s of CPU a second that every sender has
 
+PREDICTIONS_S = 0.25
+"""How late [s] a hub leaves out predictions: half of the 0.5 s after which a camera uses none of them."""
+SMOOTHED_S = 1.0
+"""How late [s] it leaves out smoothed tracks too: its status is a second old by then."""
+_STATED_S = 2.0
+"""How long a status says so afterwards: two statuses."""
+
 
 class FairShare:
     """Passes messages on in the order of their arrival, as long as their senders take no more than their share.
@@ -107,14 +114,6 @@ class FairShare:
 
 def _rows(one: Received) -> int:
     return 2 + len(one.message.detections) if isinstance(one.message, pb.Observation) else 2
-
-
-PREDICTIONS_S = 0.25
-"""How late [s] a hub leaves out predictions: half of the 0.5 s after which a camera uses none of them."""
-SMOOTHED_S = 1.0
-"""How late [s] it leaves out smoothed tracks too: its status is a second old by then."""
-_STATED_S = 2.0
-"""How long a status says so afterwards: two statuses."""
 
 
 class Shedding:

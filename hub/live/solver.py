@@ -22,6 +22,19 @@ from protocols.session.calibration import Calibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
+_SEARCH_LOAD, _UPDATE_LOAD = 0.6, 0.2
+"""CPU seconds of the solver per second before the first answer, and after it: a longer job is followed by a longer
+pause."""
+_SEARCH_EVERY_S = 4.0
+"""Between two searches for cameras that are not tied."""
+_FULL_EVERY_S, _FULL_GROWTH = 30.0, 1.5
+"""Between two searches over all lags, and the growth of rows from which lenses are decided again."""
+_FIRST_FULL_S = 60.0
+"""Until the first search over all lags where times of arrival bound them: it takes several seconds, and at a right
+arrival it finds nothing more."""
+_LEFT_OUT_S = 60.0
+"""How long a camera is left out without which the solver does not fail."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolverJob:
@@ -150,20 +163,6 @@ def _verified(job: SolverJob) -> Calibration:
         refused=dict(found.unused),
         warnings=found.warnings,
     )
-
-
-_SEARCH_LOAD, _UPDATE_LOAD = 0.6, 0.2
-"""CPU seconds of the solver per second before the first answer, and after it: a longer job is followed by a longer
-pause."""
-_SEARCH_EVERY_S = 4.0
-"""Between two searches for cameras that are not tied."""
-_FULL_EVERY_S, _FULL_GROWTH = 30.0, 1.5
-"""Between two searches over all lags, and the growth of rows from which lenses are decided again."""
-_FIRST_FULL_S = 60.0
-"""Until the first search over all lags where times of arrival bound them: it takes several seconds, and at a right
-arrival it finds nothing more."""
-_LEFT_OUT_S = 60.0
-"""How long a camera is left out without which the solver does not fail."""
 
 
 @dataclass(slots=True)

@@ -22,6 +22,16 @@ _WIDTH, _LEFT, _RIGHT = 1000.0, 130.0, 16.0  # px of the drawing, and of its mar
 _MAX_SPANS = 400  # drawn per camera; long recordings have more
 _TIME_BINS, _ROWS_A_BIN = 250, 8  # largest number of bins; rows per bin for meaningful quantiles
 
+_INDENT, _KEYS, _HEIGHT = 84.0, 190.0, 250.0  # px: margins of the axis and of the names, and the drawing
+_DASHES = ("", "9 4", "2 4", "14 4 2 4", "5 2", "1 3")
+_STAGES = {
+    "first poses": "cameras added",
+    "robust": "all rows, robust",
+    "fitting rows": "inlier rows",
+    "free lenses": "free intrinsics",
+    "correlated noise": "correlated noise",
+}
+
 
 def offset_intervals(calibration: Calibration, used: dict[str, RowUsage]) -> str:
     """Each camera's time offset with its 95 % interval around the estimate, on a common scale in milliseconds."""
@@ -166,10 +176,6 @@ def _bars(rows: list[tuple[str, list[Span], str]], axis: str, label: str) -> str
     return drawing(_WIDTH, height, parts, label)
 
 
-_INDENT, _KEYS, _HEIGHT = 84.0, 190.0, 250.0  # px: margins of the axis and of the names, and the drawing
-_DASHES = ("", "9 4", "2 4", "14 4 2 4", "5 2", "1 3")
-
-
 @dataclass(frozen=True, slots=True)
 class OffsetStdSample:
     """One calibration in a log: seconds since its start, and the std of each camera's time offset [s]."""
@@ -226,15 +232,6 @@ def offset_std_history(history: tuple[OffsetStdSample, ...], reference: str) -> 
         parts,
         f"Std of the clock offsets after each calibration, from {first} s on",
     )
-
-
-_STAGES = {
-    "first poses": "cameras added",
-    "robust": "all rows, robust",
-    "fitting rows": "inlier rows",
-    "free lenses": "free intrinsics",
-    "correlated noise": "correlated noise",
-}
 
 
 def adjustment_history(steps: tuple[AdjustmentStep, ...]) -> str:

@@ -16,31 +16,10 @@ VERBS = {
 }
 """What the user does with the target, by its name."""
 
-
-def target_of(rig: Rig, labels: list[str]) -> str:
-    """What the user moves, in one word: as the session or the only label says, a board where there are bodies, a person
-    with joints."""
-    given = rig.metadata.get("target", labels[0] if len(labels) == 1 else None)
-    if isinstance(given, str) and given in VERBS:
-        return given
-    if rig.bodies:
-        return "board" if max(len(body) for body in rig.bodies.values()) > 4 else "tag"
-    return "person" if any(label.endswith(("hip", "knee", "shoulder", "head", "foot")) for label in labels) else ANY
-
-
-def in_words_of(text: str, rig: Rig, labels: list[str]) -> str:
-    """A text on "the point", which says what the user moves instead, where that is known."""
-    word = target_of(rig, labels)
-    for article in ("the", "The", "this") if word != ANY else ():
-        text = text.replace(f"{article} point", f"{article} {word}")
-    return text
-
-
 _LONGER = (
     "record longer while the point moves fast and irregularly (change direction and height, never the same "
     "loop twice) where both cameras see it"
 )
-
 # text in the reason → what to do; the first match is used
 _REMEDIES: tuple[tuple[str, str], ...] = (
     ("no observations", "check that the camera recorded and whether its detector finds the point."),
@@ -64,6 +43,25 @@ _REMEDIES: tuple[tuple[str, str], ...] = (
     ("agrees with", f"check that both detected the same point and that their intrinsics are right; {_LONGER}."),
     ("px", "check the intrinsics in rig.toml and remove false detections."),
 )
+
+
+def target_of(rig: Rig, labels: list[str]) -> str:
+    """What the user moves, in one word: as the session or the only label says, a board where there are bodies, a person
+    with joints."""
+    given = rig.metadata.get("target", labels[0] if len(labels) == 1 else None)
+    if isinstance(given, str) and given in VERBS:
+        return given
+    if rig.bodies:
+        return "board" if max(len(body) for body in rig.bodies.values()) > 4 else "tag"
+    return "person" if any(label.endswith(("hip", "knee", "shoulder", "head", "foot")) for label in labels) else ANY
+
+
+def in_words_of(text: str, rig: Rig, labels: list[str]) -> str:
+    """A text on "the point", which says what the user moves instead, where that is known."""
+    word = target_of(rig, labels)
+    for article in ("the", "The", "this") if word != ANY else ():
+        text = text.replace(f"{article} point", f"{article} {word}")
+    return text
 
 
 def remedy_for(reason: str) -> str:

@@ -9,6 +9,8 @@ from hub.sync.null_distribution import bandwidth
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import SmoothTrack
 
+_COARSENING = 8.0  # times the grid step of the full scan
+
 
 class TrackCache:
     """Resampled grids, bandwidths and image speeds, keyed by the identity of the track objects.
@@ -39,9 +41,6 @@ class TrackCache:
         if id(track) not in self._motions:
             self._motions[id(track)] = track, bandwidth(track), fast_image_speed(track)
         return self._motions[id(track)]
-
-
-_COARSENING = 8.0  # times the grid step of the full scan
 
 
 def ranking_score(

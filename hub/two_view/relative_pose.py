@@ -25,6 +25,8 @@ _SYMMETRIC_INDEX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Index of each entry of a symmetric 3x3 matrix among its six upper ones."""
 _REWEIGHTINGS = 4  # of a homography: outliers have lost their weight by then
 
+_MIN_PAIRS = 8  # of the eight-point algorithm
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePose:
@@ -277,9 +279,6 @@ def orthogonal_axes(direction: Floats) -> Floats:
     length = math.sqrt(p * p + q * q + r * r)
     p, q, r = p / length, q / length, r / length
     return np.array([[p, q, r], [y * r - z * q, z * p - x * r, x * q - y * p]])
-
-
-_MIN_PAIRS = 8  # of the eight-point algorithm
 
 
 def hartley_normalisation(points: Floats) -> Floats:

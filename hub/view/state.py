@@ -43,6 +43,11 @@ _WORDS: dict[str, CameraState] = {
     "refused": "refused",
 }
 
+LATCHED = (topics.CAMERA_INFO, topics.CALIBRATION, topics.STATUS, topics.UAV_INFO)
+"""Topics of which the last message of each sender is valid until it is replaced."""
+TOPICS = (*LATCHED, topics.OBSERVATION, topics.TRACK, topics.TARGET)
+ON_IMAGES = (topics.TARGET_CLOUD, topics.ROAD_MAP)
+
 
 @dataclass(slots=True, eq=False)
 class CameraView:
@@ -107,10 +112,6 @@ class CameraView:
         return self.verdict
 
 
-LATCHED = (topics.CAMERA_INFO, topics.CALIBRATION, topics.STATUS, topics.UAV_INFO)
-"""Topics of which the last message of each sender is valid until it is replaced."""
-TOPICS = (*LATCHED, topics.OBSERVATION, topics.TRACK, topics.TARGET)
-ON_IMAGES = (topics.TARGET_CLOUD, topics.ROAD_MAP)
 PathPoint = tuple[float, float, float, float, float, float]
 """Reference time [s], x, y, z, std of one axis, 1 if coasting."""
 

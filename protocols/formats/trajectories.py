@@ -18,6 +18,12 @@ from protocols.session.calibration import TrajectoryTable, read_labelled_rows
 from protocols.session.observations import Observations
 from protocols.session.rig import METRES_PER_UNIT
 
+_BRIDGED = 1.5  # frame intervals between the observations of one interpolation: none where a frame between is missing
+_IMAGE = (
+    "sync_index,cam_id,frame_index,frame_time,object_id,keypoint_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y,obj_loc_z"
+)
+_WORLD = "sync_index,object_id,keypoint_id,x_coord,y_coord,z_coord,frame_time"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrajectoryGrid:
@@ -111,13 +117,6 @@ def grid_frames(paths: Mapping[str, Floats]) -> tuple[Floats, Ints]:
     step = float(np.quantile(steps, 0.1, method="lower"))
     ahead = np.maximum(np.rint(np.diff(times) / step), 1).astype(np.int64)
     return times, np.r_[np.zeros(1, dtype=np.int64), np.cumsum(ahead)]
-
-
-_BRIDGED = 1.5  # frame intervals between the observations of one interpolation: none where a frame between is missing
-_IMAGE = (
-    "sync_index,cam_id,frame_index,frame_time,object_id,keypoint_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y,obj_loc_z"
-)
-_WORLD = "sync_index,object_id,keypoint_id,x_coord,y_coord,z_coord,frame_time"
 
 
 def point_tables(

@@ -32,6 +32,8 @@ _REPLACED_METADATA = (
 _LAG_KEYS = ("lag_time", "lag_std", "clock_rate_std")
 """What says where a lag's std holds: without them a hub that goes on from the file has a lag of no std."""
 
+_COLUMNS = ("time", "x", "y", "z", "std")
+
 
 @dataclass(frozen=True, slots=True)
 class Sensitivity:
@@ -313,9 +315,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return value + 0.0
     return value
-
-
-_COLUMNS = ("time", "x", "y", "z", "std")
 
 
 def read_trajectory(file: Path) -> tuple[TrajectoryTable, ...]:

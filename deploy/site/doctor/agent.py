@@ -29,6 +29,22 @@ _SUBSCRIBES_TO_ALL = ("hub", "recorder", "uav")
 _SHOWN_ROLES = ("camera", "hub", "record", "router", "uav", "view")
 CERTIFICATE_ROLES = {"recorder": "record"}
 
+_PATIENCE_S = 3.0  # in which TCP sends its first packet three times
+_UNREACHABLE = {
+    errno.ECONNREFUSED: (
+        "{host} answers, but nothing listens at port {port}",
+        "start one there (`systemctl status 'syncline-router-*'`), or correct the port in connect",
+    ),
+    errno.EHOSTUNREACH: (
+        "{host} does not answer in its own network",
+        "is that machine on, its cable in, its address right (`ip address` there)?",
+    ),
+    errno.ENETUNREACH: (
+        "this machine has no route to {host}",
+        "connect its network (`ip address`, `ip route` here): cable, Wi-Fi, DHCP",
+    ),
+}
+
 
 def camera(
     device: Device, *, patience_s: float = 5.0, measure_s: float = 1.0, now: Callable[[], float] = time.monotonic
@@ -243,23 +259,6 @@ def _as_client(bus: BusConfig) -> BusConfig | None:
     if not connect:
         return None
     return BusConfig(mode="client", connect=connect, tls=bus.tls)
-
-
-_PATIENCE_S = 3.0  # in which TCP sends its first packet three times
-_UNREACHABLE = {
-    errno.ECONNREFUSED: (
-        "{host} answers, but nothing listens at port {port}",
-        "start one there (`systemctl status 'syncline-router-*'`), or correct the port in connect",
-    ),
-    errno.EHOSTUNREACH: (
-        "{host} does not answer in its own network",
-        "is that machine on, its cable in, its address right (`ip address` there)?",
-    ),
-    errno.ENETUNREACH: (
-        "this machine has no route to {host}",
-        "connect its network (`ip address`, `ip route` here): cable, Wi-Fi, DHCP",
-    ),
-}
 
 
 def reach(endpoint: str, patience_s: float = _PATIENCE_S) -> CheckResult | None:

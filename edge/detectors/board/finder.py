@@ -31,6 +31,15 @@ _SUBPIX_SHARE, _SUBPIX_SHARE_OF_TAGS = 0.4, 0.12  # of the distance of neighbour
 _LEAST_CUT = 3  # rows and columns of corners of a part of a chessboard, OpenCV's least
 _MOST_CHANGE = 0.4  # of the step between corners to the next: a board seen from 5 squares away, tilted by 60 degrees
 
+_SIGMA = 1.5  # px: smoothing before derivatives
+_MIN_CONTRAST = 8.0  # grey levels between dark and light squares
+_MOST = 4000  # strongest saddles
+_RING = 5  # px: radius at which a saddle's phase is measured
+_NEIGHBOURS = 12  # in a board tilted by 60 degrees, the next corner across is the ninth at worst
+_ANGLE = np.radians(45.0)  # of a phase, which is twice an angle, from that of ideal corners, seen straight
+_BEND = 0.3  # of the step between corners to the next
+_SHARE = 0.6  # of the second harmonic in the variance on the ring; 0.81 round an ideal corner, seen straight
+
 
 class Finder:
     """Finds the corners of one print of a board; keeps no state."""
@@ -297,15 +306,6 @@ def _tag_detector(board: Board) -> Any:
 
 
 Complexes = npt.NDArray[np.complex128]
-
-_SIGMA = 1.5  # px: smoothing before derivatives
-_MIN_CONTRAST = 8.0  # grey levels between dark and light squares
-_MOST = 4000  # strongest saddles
-_RING = 5  # px: radius at which a saddle's phase is measured
-_NEIGHBOURS = 12  # in a board tilted by 60 degrees, the next corner across is the ninth at worst
-_ANGLE = np.radians(45.0)  # of a phase, which is twice an angle, from that of ideal corners, seen straight
-_BEND = 0.3  # of the step between corners to the next
-_SHARE = 0.6  # of the second harmonic in the variance on the ring; 0.81 round an ideal corner, seen straight
 
 
 def linked_saddles(grey: npt.NDArray[np.uint8], least: int) -> list[tuple[Floats, Floats, int]]:

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from edge.detectors.base import Detection, Prediction
 from edge.detectors.marker.colour import ColourModel, colour_indices, learn_colour_model
-from edge.detectors.marker.subpixel_outline import Outline, StaticBackground, measure_outline
+from edge.detectors.marker.static_background import StaticBackground
+from edge.detectors.marker.subpixel_outline import Outline, measure_outline
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.sphere_projection import outline_to_centre

@@ -86,7 +86,7 @@ class TagDetector:
         sides = _measure_sides(grey, quad)
         if sides is None:
             return None
-        lines, covariances, contrast, scatter, width, blur_std, *_ = sides
+        lines, covariances, contrast, scatter, width, blur_std, _ = sides
         corners = _corners(lines)
         if corners is None or _far(corners, quad):
             return None
@@ -116,7 +116,19 @@ def refined_corners(grey: npt.NDArray[np.uint8], quad: Floats) -> Floats:
     Sides are parabolas, for the lens bends them; those that it bends more are not.
     """
     sides = _measure_sides(grey, quad)
-    corners = None if sides is None or sides[-1] > _BENT_PX else _corners(*sides[-2])
+    ends, starts = np.zeros((4, 2, 2)), np.zeros((4, 2, 2))  # tangents, as lines
+    for index, (point, half, outward, places, offset) in enumerate(() if sides is None else sides[-1]):
+        x = places / np.linalg.norm(half)
+        curve, _, _ = _fit_line(x, offset, float(places[1] - places[0]), 2)
+        if abs(curve[2]) > _BENT_PX:
+            return quad
+        for end, tangents in ((1.0, ends), (-1.0, starts)):
+            tangents[index] = (
+                point + end * half + (curve @ [1.0, end, 1.0]) * outward,
+                half + (curve[1] + 2.0 * curve[2] * end) * outward,
+            )
+            tangents[index, 1] /= np.linalg.norm(tangents[index, 1])
+    corners = None if sides is None else _corners(ends, starts)
     return quad if corners is None or _far(corners, quad) else corners
 
 
@@ -137,13 +149,13 @@ def _detector(name: str) -> Any:
 
 def _measure_sides(
     grey: npt.NDArray[np.uint8], quad: Floats
-) -> tuple[Floats, Floats, float, float, float, float, tuple[Floats, Floats], float] | None:
+) -> tuple[Floats, Floats, float, float, float, float, list[tuple[Floats, Floats, Floats, Floats, Floats]]] | None:
     """Lines of the four sides, their covariances, contrast and scatter; None where a side cannot be measured.
 
     lines: (4, 2, 2): a point on each and its unit direction. covariances: (4, 2, 2) of the offset at that point [px²]
     and of the angle [rad²]. contrast: of the weakest side. scatter: of the worst, in px. Then come the width of
-    the widest border and the std caused by a border smeared over a whole cell, in px; the tangents at the end and at
-    the start of each side, as lines; and how far the middle of the most bent one lies off its chord, in px.
+    the widest border and the std caused by a border smeared over a whole cell, in px; and the edge of each side: its
+    middle, from there to its end, unit vector outward, places along it and the edge's offsets outward there.
     """
     lines = np.zeros((4, 2, 2))
     covariances = np.zeros((4, 2, 2))
@@ -152,8 +164,8 @@ def _measure_sides(
     for _ in range(_PASSES):
         middle = corners.mean(axis=0)
         contrast, worst, widest, blur_std = np.inf, 0.0, 0.0, 0.0
-        contrasts, halves, bends = np.zeros(4), np.zeros(4), np.zeros(4)
-        tangents = np.zeros((4, 2, 2)), np.zeros((4, 2, 2))
+        contrasts, halves = np.zeros(4), np.zeros(4)
+        edges: list[tuple[Floats, Floats, Floats, Floats, Floats]] = []
         for index in range(4):
             start, end = corners[index], corners[(index + 1) % 4]
             length = float(np.linalg.norm(end - start))
@@ -175,13 +187,7 @@ def _measure_sides(
             full = max(width / (2.0 * half) - _PROFILE_FILL, 0.0) / _PROFILE_FILL_STEP
             blur_std = max(blur_std, _FLOOR_FULL * full * max(width - _SHARP, 0.0))
             line, covariance, scatter = _fit_line(places, offset, length / count)
-            curve, _, _ = _fit_line(places / (0.5 * length), offset, length / count, 2)
-            bends[index] = abs(curve[2])
-            for x, ends in zip((1.0, -1.0), tangents, strict=True):
-                ends[index] = (
-                    point + 0.5 * x * length * along + (curve @ [1.0, x, 1.0]) * outward,
-                    along + 2.0 / length * (curve[1] + 2.0 * curve[2] * x) * outward,
-                )
+            edges.append((point, 0.5 * length * along, outward, places, offset))
             contrasts[index], halves[index] = weakest, half
             contrast, worst, widest = min(contrast, weakest), max(worst, scatter), max(widest, width)
             lines[index] = point + line[0] * outward, along + line[1] * outward
@@ -193,9 +199,7 @@ def _measure_sides(
         corners = found
     contrast_std = _FLOOR_CONTRAST * float((halves * (1.0 - contrasts / contrasts.max())).max())
     blur_std = float(np.hypot(blur_std, contrast_std))
-    if contrast < _LEAST_CONTRAST:
-        return None
-    return lines, covariances, contrast, worst, widest, blur_std, tangents, float(bends.max())
+    return (lines, covariances, contrast, worst, widest, blur_std, edges) if contrast >= _LEAST_CONTRAST else None
 
 
 def _edge_offsets(

@@ -26,6 +26,14 @@ _LEAST_NOISE = 2.0  # 8-bit steps
 _BINS, _MIN_PIXELS, _FORGETTING = 53, 2000, 0.99
 _DARK_QUANTILE, _MARGIN = 0.04, 0.03  # quantile of the attenuation of certain shadows, and a margin below it
 
+GHOST_STEP = 22  # 8-bit steps
+# over the height: distance from a rim that is compared; smallest number of its pixels
+_RIM_REACH_SHARE, _MIN_RIM_PIXELS = 0.04, 10
+# window over the image height; reach of a rim [px]; contrast ratio, as _GHOST_RATIO
+_VOTE_WINDOW, _RIM_REACH, _UNCOVERED_RATIO = 0.12, 7, 1.6
+# factor between the contrasts of background and image; smallest contrast of the background [8-bit steps]
+_GHOST_RATIO, _MIN_GHOST_CONTRAST = 1.4, 12.0
+
 
 class ShadowDetector:
     """Shadow detector of one camera, which learns how dark shadows are.
@@ -121,14 +129,6 @@ def _texture_test(
 
 
 Box = tuple[float, float, float, float]
-
-GHOST_STEP = 22  # 8-bit steps
-# over the height: distance from a rim that is compared; smallest number of its pixels
-_RIM_REACH_SHARE, _MIN_RIM_PIXELS = 0.04, 10
-# window over the image height; reach of a rim [px]; contrast ratio, as _GHOST_RATIO
-_VOTE_WINDOW, _RIM_REACH, _UNCOVERED_RATIO = 0.12, 7, 1.6
-# factor between the contrasts of background and image; smallest contrast of the background [8-bit steps]
-_GHOST_RATIO, _MIN_GHOST_CONTRAST = 1.4, 12.0
 
 
 def remove_ghosts(foreground: Image, now: Image, then: Image, where: Image) -> Image:

@@ -29,6 +29,50 @@ _INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _MAX_MEMORY = 4 << 30
 """[bytes] of all models of a process in onnxruntime: four times the largest model file that is accepted."""
 
+MAX_BYTES = 1 << 30
+"""Of model and external data together: ten times the largest common detectors (YOLOv8x: 0.26 GiB)."""
+_MAX_DEPTH = 8
+"""Of graphs within graphs."""
+_LOOPS = frozenset({"Loop", "Scan"})
+_REMEDY = "export the model again"
+# The part of onnx.proto3 (onnx.ai, IR version 10) that is looked at: message → field → (number, type, repeated).
+_FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
+    "Model": {"ir_version": (1, "int64", False), "graph": (7, "Graph", False), "functions": (25, "Function", True)},
+    "Function": {"node": (7, "Node", True)},
+    "Graph": {
+        "node": (1, "Node", True),
+        "initializer": (5, "Tensor", True),
+        "input": (11, "Value", True),
+        "sparse_initializer": (15, "Sparse", True),
+    },
+    "Value": {"name": (1, "string", False), "type": (2, "Type", False)},
+    "Type": {"tensor_type": (1, "TensorType", False)},
+    "TensorType": {"shape": (2, "Shape", False)},
+    "Shape": {"dim": (1, "Dimension", True)},
+    "Dimension": {"dim_value": (1, "int64", False), "dim_param": (2, "string", False)},
+    "Node": {
+        "input": (1, "string", True),
+        "output": (2, "string", True),
+        "op_type": (4, "string", False),
+        "attribute": (5, "Attribute", True),
+    },
+    "Attribute": {
+        "t": (5, "Tensor", False),
+        "g": (6, "Graph", False),
+        "tensors": (10, "Tensor", True),
+        "graphs": (11, "Graph", True),
+        "sparse_tensor": (22, "Sparse", False),
+        "sparse_tensors": (23, "Sparse", True),
+    },
+    "Sparse": {"values": (1, "Tensor", False), "indices": (2, "Tensor", False)},
+    "Tensor": {
+        "name": (8, "string", False),
+        "external_data": (13, "Entry", True),
+        "data_location": (14, "int64", False),
+    },
+    "Entry": {"key": (1, "string", False), "value": (2, "string", False)},
+}
+
 
 class Runtime(Protocol):
     """A loaded model. batch: the fixed number of images that it takes, 0 = any number."""
@@ -148,52 +192,6 @@ def _unusable(file: Path, error: Exception) -> InputError:
     elif len(text) > 240:
         text = f"{text[:120]} … {text[-120:]}"
     return InputError(f"the model cannot be run: {text}", file=file, remedy="export it again, and check `input`")
-
-
-MAX_BYTES = 1 << 30
-"""Of model and external data together: ten times the largest common detectors (YOLOv8x: 0.26 GiB)."""
-_MAX_DEPTH = 8
-"""Of graphs within graphs."""
-_LOOPS = frozenset({"Loop", "Scan"})
-_REMEDY = "export the model again"
-
-# The part of onnx.proto3 (onnx.ai, IR version 10) that is looked at: message → field → (number, type, repeated).
-_FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
-    "Model": {"ir_version": (1, "int64", False), "graph": (7, "Graph", False), "functions": (25, "Function", True)},
-    "Function": {"node": (7, "Node", True)},
-    "Graph": {
-        "node": (1, "Node", True),
-        "initializer": (5, "Tensor", True),
-        "input": (11, "Value", True),
-        "sparse_initializer": (15, "Sparse", True),
-    },
-    "Value": {"name": (1, "string", False), "type": (2, "Type", False)},
-    "Type": {"tensor_type": (1, "TensorType", False)},
-    "TensorType": {"shape": (2, "Shape", False)},
-    "Shape": {"dim": (1, "Dimension", True)},
-    "Dimension": {"dim_value": (1, "int64", False), "dim_param": (2, "string", False)},
-    "Node": {
-        "input": (1, "string", True),
-        "output": (2, "string", True),
-        "op_type": (4, "string", False),
-        "attribute": (5, "Attribute", True),
-    },
-    "Attribute": {
-        "t": (5, "Tensor", False),
-        "g": (6, "Graph", False),
-        "tensors": (10, "Tensor", True),
-        "graphs": (11, "Graph", True),
-        "sparse_tensor": (22, "Sparse", False),
-        "sparse_tensors": (23, "Sparse", True),
-    },
-    "Sparse": {"values": (1, "Tensor", False), "indices": (2, "Tensor", False)},
-    "Tensor": {
-        "name": (8, "string", False),
-        "external_data": (13, "Entry", True),
-        "data_location": (14, "int64", False),
-    },
-    "Entry": {"key": (1, "string", False), "value": (2, "string", False)},
-}
 
 
 def check_model_file(file: Path) -> dict[str, list[int | str]]:

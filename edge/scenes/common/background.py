@@ -26,6 +26,12 @@ _BOX_BGR = ((96, 140, 178), (150, 120, 70), (70, 78, 90), (88, 150, 92), (60, 60
 # No two poster colours mix to the marker's: a truly orange patch would be a second marker.
 _POSTER_BGR = ((60, 60, 190), (150, 140, 60), (150, 110, 60), (90, 130, 90), (120, 80, 140))
 
+PEDESTAL = 20
+"""Offset of the stored noise, so that one saturating 8-bit addition applies it."""
+_BACKGROUND_STREAM = 2  # of a scene's random numbers, beside those of cameras (0) and of what moves (1)
+_BACKGROUND_WIDTH = 960  # px; wider images get a background of this width, enlarged
+_BANK_MARGIN = 96  # px by which the noise image exceeds the image: 9216 different crops
+
 
 def room(rays: Floats, eye: Floats, half: float, height: float, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
     """A furnished room (H, W, 3) BGR.
@@ -188,13 +194,6 @@ def _finish(colour: Floats, shape: tuple[int, ...]) -> npt.NDArray[np.uint8]:
     """Round to 8 bits, blurred as by a lens."""
     image = np.clip(colour, 0.0, 255.0).reshape(shape[0], shape[1], 3).astype(np.float32)
     return np.asarray(np.rint(cv2.GaussianBlur(image, (0, 0), 0.6)), dtype=np.uint8)
-
-
-PEDESTAL = 20
-"""Offset of the stored noise, so that one saturating 8-bit addition applies it."""
-_BACKGROUND_STREAM = 2  # of a scene's random numbers, beside those of cameras (0) and of what moves (1)
-_BACKGROUND_WIDTH = 960  # px; wider images get a background of this width, enlarged
-_BANK_MARGIN = 96  # px by which the noise image exceeds the image: 9216 different crops
 
 
 def pixel_rays(lens: Intrinsics, u: Floats, v: Floats) -> Floats:

@@ -22,6 +22,8 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats, Ints
 
+MIXED_FPS = (30.0, 25.0, 29.97, 50.0)  # PAL, NTSC and phones: no two cameras alike
+
 
 @dataclass(frozen=True, slots=True)
 class SimulatedClock:
@@ -175,9 +177,6 @@ def rescale_intrinsics(lens: Intrinsics, width: int) -> Intrinsics:
     matrix[:2] *= factor
     matrix[:2, 2] += 0.5 * factor - 0.5
     return Intrinsics(width, height, matrix, np.asarray(lens.distortions), lens.fisheye)
-
-
-MIXED_FPS = (30.0, 25.0, 29.97, 50.0)  # PAL, NTSC and phones: no two cameras alike
 
 
 @dataclass(frozen=True, slots=True)

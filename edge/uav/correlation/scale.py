@@ -69,7 +69,7 @@ class BoxFlow:
         p, q = points[good].astype(np.float64) - middle, moved[good].astype(np.float64) - middle
         if stood is not None:
             shift = (stood - centre) @ box.axes * per_pixel
-            # More than a pixel here, and half of one in the image, tells: what moves as the scene does is background.
+            # From a pixel here, and half of one in the image, on: what moves as the scene does is background.
             if np.hypot(*shift) > max(1.0, 0.5 * per_pixel):
                 good = np.square(q - p - shift).sum(axis=1) > np.square(q - p).sum(axis=1)
                 p, q = p[good], q[good]

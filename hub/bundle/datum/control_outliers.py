@@ -61,6 +61,9 @@ named a wrong camera in one case of six, at a ratio of 80."""
 _EXHAUSTIVE_LIMIT = 10
 """Control points up to which all pairs are tried; with more, the search is greedy: the worst, then the next worst."""
 
+_MAX_ITERATIONS = 8  # of Gauss-Newton, which begins at the observations' optimum
+_RELATIVE_TOLERANCE = 1e-9  # relative decrease of the cost at convergence
+
 
 def reject_outliers(rig: Rig, names: list[str], poses: list[Pose]) -> tuple[Rig, tuple[str, ...]]:
     """The rig without the outliers that `find_outliers` finds, and a description of each."""
@@ -253,10 +256,6 @@ def reject_refuted(rig: Rig, names: list[str], poses: list[Pose], network: Float
             break
         freedoms = np.concatenate([freedoms, np.eye(len(cameras))[:, cameras == worst]], axis=1)
     return _without(rig, tuple(rejected)) if rejected else rig, tuple(warnings)
-
-
-_MAX_ITERATIONS = 8  # of Gauss-Newton, which begins at the observations' optimum
-_RELATIVE_TOLERANCE = 1e-9  # relative decrease of the cost at convergence
 
 
 def adjust_to_control_points(

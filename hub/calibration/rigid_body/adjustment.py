@@ -43,6 +43,10 @@ from protocols.session.calibration import AdjustmentStep
 _ROUNDS, _STEPS = 5, 20  # of noise estimates; Levenberg-Marquardt steps in each
 _TOLERANCE = 1e-5  # relative decrease of the cost at which it has converged
 
+_CLUSTER_VIEWS, _CLUSTER_S = 3, 0.5
+"""Views, and seconds, whose errors count as one."""
+_WINDOW = 4  # control points on each side that the std of a pose is computed from
+
 
 def adjust_bodies(problem: BodyProblem, state: BodyState) -> tuple[BodyProblem, BodyState]:
     """The adjusted state, and the problem with the rows that fit marked."""
@@ -148,11 +152,6 @@ def _step(
     if problem.free_shape:
         shape = shape + camera_step[-shape.size :].reshape(-1, 3)
     return replace(state, cameras=tuple(cameras), bodies=tuple(bodies), shift=tuple(shifts), shape=shape)
-
-
-_CLUSTER_VIEWS, _CLUSTER_S = 3, 0.5
-"""Views, and seconds, whose errors count as one."""
-_WINDOW = 4  # control points on each side that the std of a pose is computed from
 
 
 @dataclass(frozen=True, slots=True, eq=False)

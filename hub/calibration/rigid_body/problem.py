@@ -23,6 +23,9 @@ from protocols.session.calibration import AdjustmentStep
 _SHAPE_START = 2e-3  # of the distance of neighbouring points: of a print on paper
 _JITTER_START = 0.1  # of a frame interval
 
+POSE = 7
+"""Parameters of a control point: x, y, z, and the quaternion w, x, y, z."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyProblem:
@@ -100,10 +103,6 @@ def pitch(problem: BodyProblem) -> float:
 def initial_shape(problem: BodyProblem, labels: int) -> tuple[Floats, Floats]:
     """No errors (labels, 3) of the points, and their prior stds (3,) before they are estimated."""
     return np.zeros((labels, 3)), np.full(3, _SHAPE_START * pitch(problem))
-
-
-POSE = 7
-"""Parameters of a control point: x, y, z, and the quaternion w, x, y, z."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,6 +22,10 @@ from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats
 
+_MIN_OBSERVATIONS = 50.0
+"""Observations from which the residuals determine the variance factor."""
+_SINGULAR = 1e-12  # relative eigenvalue, below which a direction is not determined
+
 
 def relative_transform(own: Pose, other: Pose) -> RelativeTransform:
     """``other`` relative to ``own``."""
@@ -156,10 +160,6 @@ def intersect_rays(others: list[tuple[Pose, Floats]], rotation: Floats) -> tuple
     ahead = all(float((pose.position - position) @ ray) > 0 for (pose, _), ray in zip(others, rays, strict=True))
     return (position, sine) if ahead else None
 
-
-_MIN_OBSERVATIONS = 50.0
-"""Observations from which the residuals determine the variance factor."""
-_SINGULAR = 1e-12  # relative eigenvalue, below which a direction is not determined
 
 Edges = Mapping[tuple[str, str], QuadraticFactor]
 """By pair, the camera with the lower number (and name) first, as parametrised in `hub.distributed.factors.factor`."""

@@ -16,6 +16,10 @@ from protocols.geometry.pose import Pose
 LocalisedNeighbour: TypeAlias = tuple[StateMessage, Edge]
 """A localised neighbour's state, and the edge to it."""
 
+_REORDER_WINDOW = 256
+"""Largest reordering of one camera's messages."""
+_RECEIVED_MASK = (1 << _REORDER_WINDOW) - 1
+
 
 def localise(camera: int, neighbours: list[LocalisedNeighbour], frame: int) -> Pose | None:
     """Pose of ``camera`` in ``frame`` by the most informative edge; with bearings only, by intersection of rays.
@@ -70,11 +74,6 @@ def localise_by_resection(neighbours: list[LocalisedNeighbour], rng: np.random.G
         return None
     found = resect(np.concatenate(mine), np.concatenate(there), np.concatenate(spread), rng)
     return None if found is None else Pose(found.rotation, found.centre)
-
-
-_REORDER_WINDOW = 256
-"""Largest reordering of one camera's messages."""
-_RECEIVED_MASK = (1 << _REORDER_WINDOW) - 1
 
 
 @dataclass(slots=True, eq=False)

@@ -17,6 +17,10 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import RigCamera
 from protocols.validation.rules import SCHEMA_VERSION
 
+_UPPER = np.triu_indices(6)
+_LONGEST = 63
+"""Maximum length of a camera's id."""
+
 
 @dataclass(frozen=True, slots=True)
 class SharedObservation:
@@ -125,11 +129,6 @@ class Notice:
 
 Message: TypeAlias = SharedObservation | StateMessage
 Output: TypeAlias = StateMessage | Notice
-
-
-_UPPER = np.triu_indices(6)
-_LONGEST = 63
-"""Maximum length of a camera's id."""
 
 
 def number_of(camera: str) -> int:

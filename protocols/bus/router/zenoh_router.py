@@ -32,6 +32,10 @@ ROLE = "router"
 _TICK_S = 0.1  # several looks at the canary in DEAD_AFTER_S
 _STATUS_S = 1.0  # as all agents: health counts 5 s without a status as dead
 
+PERIOD_S = 0.25  # a quarter of DEAD_AFTER_S
+DEAD_AFTER_S = 0.9  # so that with a restart and reconnection an outage stays below two seconds
+_LATE_S = 0.4  # after which the caller itself was stopped, and not the router
+
 
 class RulesChanged(Exception):
     """The router's access rules have changed: it must be reopened to apply them."""
@@ -144,11 +148,6 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-PERIOD_S = 0.25  # a quarter of DEAD_AFTER_S
-DEAD_AFTER_S = 0.9  # so that with a restart and reconnection an outage stays below two seconds
-_LATE_S = 0.4  # after which the caller itself was stopped, and not the router
 
 
 class Canary:

@@ -55,6 +55,11 @@ _FIRST_WINDOW, _MAX_WINDOW = 1 << 8, 1 << 20
 # Chunk, attachment, metadata, message index, end of data or footer, shorter than 4 GiB: a prefilter for headers.
 _CANDIDATE = re.compile(rb"(?=[\x06\x09\x0c\x07\x0f\x02][\x00-\xff]{4}\x00{4})")
 
+_FOOTER = struct.Struct("<BQQQI")
+_CHUNK_INDEX = struct.Struct("<QQQ")
+_MAX_SUMMARY = 64 * 1024 * 1024
+"""Bytes: of some hundred thousand chunks. A file with more is read from its beginning."""
+
 
 class McapRecord(NamedTuple):
     """One MCAP record: offset, opcode, content."""
@@ -304,12 +309,6 @@ def attachment_checksum_matches(content: bytes) -> bool:
         return False
     (expected,) = struct.unpack_from("<I", content, len(content) - 4)
     return expected in (0, zlib.crc32(content[:-4]))
-
-
-_FOOTER = struct.Struct("<BQQQI")
-_CHUNK_INDEX = struct.Struct("<QQQ")
-_MAX_SUMMARY = 64 * 1024 * 1024
-"""Bytes: of some hundred thousand chunks. A file with more is read from its beginning."""
 
 
 @dataclass(frozen=True, slots=True)

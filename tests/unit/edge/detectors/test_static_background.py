@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.marker.ball import MarkerDetector
-from edge.detectors.marker.subpixel_outline import StaticBackground, is_known
+from edge.detectors.marker.static_background import StaticBackground, is_known
 from protocols.geometry.types import Bools, Floats
 
 _SIZE = (96, 128)

@@ -56,4 +56,4 @@ def test_sides_that_the_lens_bends_are_not_taken_for_lines(inverted: bool) -> No
     numbers, corners = finder.find(image)
     assert len(corners) == 4
     for found in (corners, finder.refine(image, (numbers, corners + 0.4))[1]):
-        assert np.sqrt(np.square(found - truth).sum(axis=1).mean()) < 0.35
+        assert np.sqrt(np.square(found - truth).sum(axis=1).mean()) < 0.1
