@@ -1,8 +1,9 @@
 """Loss recovery for reliable topics: the history for a late joiner, and messages lost on the way.
 
-Zenoh's advanced subscriber (1.10.2) queries a publisher's cache for missing messages, and gives up in two cases in
-which it should not:
+Zenoh's advanced subscriber (1.10.2) does both as well, and fails in three cases in which it should not:
 
+* It queries the history while it is declared, and delivers it while the caller cannot take anything yet: where it is
+  longer than the channel in between, neither ever goes on.
 * It queries the history twice: once when it is declared, once for each publisher that it detects. If the first query
   ends while replies to the second are arriving, it begins to deliver in the middle of the history and discards
   everything earlier as old: a late joiner then silently misses the beginning. Seen in 6 of 15 joins to four cameras
@@ -11,9 +12,10 @@ which it should not:
   reply takes longer than ten seconds, the query ends without a reply; the missing messages then count as lost,
   although the cache has them.
 
-Therefore a publisher whose first message is not number 0 is queried once more for the earlier ones, and a publisher
-whose sequence numbers have a gap is queried for it until the cache has confirmed that it has no more of it. Its
-messages are held back meanwhile. A witness confirms that the query reached the cache: a message that it must have.
+Therefore it is not asked for the history: a publisher that appears is queried for what it has, one whose first message
+is not number 0 for the earlier ones, and one whose sequence numbers have a gap is queried for it until the cache has
+confirmed that it has no more of it. Its messages are held back meanwhile. A witness confirms that the query reached the
+cache: a message that it must have.
 
 What a sender says of its publisher's identity and numbers is not authenticated, only its right to a key is. So nothing
 that is learned on one key has an effect on another, and a number far ahead of all others silences nobody: while a gap
@@ -27,6 +29,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Generic, TypeVar
 
 _Source = TypeVar("_Source", bound=Hashable)
@@ -42,6 +45,8 @@ _MAX_SOURCES, _MAX_OF_KEY = 16_384, 16
 _MAX_BYTES, _MAX_BYTES_OF_KEY = 64 * 1024 * 1024, 8 * 1024 * 1024
 """Bytes held back at once, of all publishers together and of one."""
 _SEQUENCE_MODULUS = 2**32  # Zenoh's sequence numbers have 32 bits
+NEWEST = _SEQUENCE_MODULUS // 2 - 1
+"""As the end of a query: all there is. Zenoh's cache takes a longer range for one that wraps around: empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +126,17 @@ class Backfill(Generic[_Source]):
         for question in questions:
             self._ask(question)
 
+    def appeared(self, source: _Source, key: str) -> None:
+        """A publisher has appeared, or again after an outage: query what it has that was not received."""
+        who = key, source
+        with self._lock:
+            if who in self._held:
+                return
+            if who not in self._next:
+                self._remember(who)
+            question = self._hold(who, self._next.get(who, 0), NEWEST + 1, joining=True)
+        self._ask(question)
+
     def answer(self, query: RecoveryQuery[_Source], number: int, key: str, payload: bytes) -> None:
         """Process one reply to a query."""
         with self._lock:
@@ -174,7 +190,8 @@ class Backfill(Generic[_Source]):
             if number == held.low and not held.joining:
                 self._continue(who, held, payload)
                 return self._release(who) if held.low == held.first else None
-            if held.joining and (number - held.first) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2:
+            behind = (number - held.first) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2
+            if held.joining and behind and held.later and held.later[0][0] == held.first:
                 # A publisher's numbers arrive in order: what came first was another's.
                 self._bytes -= self._held.pop(who).bytes
                 return self._begin(who, number, payload, held.since)
@@ -206,12 +223,14 @@ class Backfill(Generic[_Source]):
         return question
 
     def _hold(
-        self, who: tuple[str, _Source], low: int, first: int, payload: bytes, *, joining: bool
+        self, who: tuple[str, _Source], low: int, first: int, payload: bytes | None = None, *, joining: bool
     ) -> RecoveryQuery[_Source]:
+        """payload: of message ``first``, None where none has arrived."""
         held = self._held[who] = _PendingMessages(low, first, joining, self._clock(), 0)
         self._next[who] = -1  # no message is in sequence while these are held back
-        held.later.append((first, payload))
-        self._keep(held, len(payload))
+        if payload is not None:
+            held.later.append((first, payload))
+            self._keep(held, len(payload))
         return self._question(who, held)
 
     def _continue(self, who: tuple[str, _Source], held: _PendingMessages, payload: bytes) -> None:
@@ -240,13 +259,27 @@ class Backfill(Generic[_Source]):
             # The numbers went on where they had been: what was far ahead of them was another's.
             self._next[who] = held.low
             return None
+        if held.joining and held.low and held.early:  # after an outage: a gap before the newest, like any other
+            first = max(held.early)
+            question = self._hold(who, held.low, first, held.early.pop(first), joining=False)
+            gap = self._held[who]
+            gap.early, gap.later = held.early, gap.later + held.later
+            self._keep(gap, held.bytes)
+            return self._release(who) if len(gap.early) == first - gap.low else question
         for _, message in sorted(held.early.items()):
             self._push(source, key, message)
         missing = held.first - held.low - len(held.early)
         if missing and not held.joining:
             self._lost(missing)
-        # What a late joiner heard first is its publisher's only if the cache has what was before it.
-        expected = max(held.early, default=held.first - 1) + 1 if held.joining else held.first
+        expected = held.first
+        if held.joining:
+            # What a late joiner heard first is its publisher's only if the cache has what was before it.
+            held.later = deque(sorted(held.later, key=itemgetter(0)))  # a publisher's own arrive in order
+            begin = held.low or next((number for number, _ in held.later), None)
+            if not held.early and begin is None:  # nothing yet: what comes first is a late joiner's still
+                del self._next[who]
+                return None
+            expected = max(held.early, default=(begin or 0) - 1) + 1
         while held.later:
             number, payload = held.later.popleft()
             behind = (number - expected) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2

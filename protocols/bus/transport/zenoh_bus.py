@@ -18,7 +18,7 @@ from google.protobuf.message import Message
 
 from protocols.bus.base import BusDead, Received
 from protocols.bus.settings import BusConfig
-from protocols.bus.transport.backfill import Backfill, RecoveryQuery
+from protocols.bus.transport.backfill import NEWEST, Backfill, RecoveryQuery
 from protocols.bus.transport.inbox import Arrived, InboxSubscription, LivenessTracker, subscription_key
 from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
 from protocols.core.closing import Closing
@@ -36,6 +36,9 @@ _CHANNEL, _AT_ONCE = 512, 256
 at once: 100 KB, which are in the processor's cache when the reader decodes them."""
 _YIELD_S = 1e-4  # after as many: else the reader gets the interpreter's lock back after 5 ms only
 _MAX_KEYS, _KEYS_PER_CALL = 8192, 8  # that are declared in all, and by one drain
+
+_ADVANCED = "/@adv/pub/"
+"""Between the key of an advanced publisher and its identity, in the keys of its token and its cache."""
 
 _Source: TypeAlias = tuple[str, int]
 """A publisher's identity in Zenoh: session id and entity id."""
@@ -155,15 +158,31 @@ class ZenohSubscription(InboxSubscription):
                 session,
                 key,
                 zenoh.handlers.FifoChannel(_CHANNEL),
-                # No max_samples: it would also cap what is recovered after an outage.
-                history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
                 recovery=recovery if self._reliable else None,
             )
         threading.Thread(target=self._collect, args=(self._subscriber.handler,), name=f"bus {key}").start()
+        # A query waits for Zenoh's tables, which Zenoh holds while it waits for room in the channel.
+        asking = map(self._ask, iter(self._questions.get, None))
+        threading.Thread(target=deque, args=(asking, 0), name=f"recovery {key}").start()
+        with zenoh_call(f"watch {key}"):
+            self._publishers: zenoh.Subscriber[None] = session.liveliness().declare_subscriber(
+                f"{key}{_ADVANCED}**", zenoh.handlers.Callback(self._appeared, indirect=False), history=True
+            )
+
+    def _appeared(self, token: zenoh.Sample) -> None:
+        """Query the history of a publisher that has appeared; called from Zenoh's threads."""
+        key, _, identity = str(token.key_expr).partition(_ADVANCED)
+        try:
+            session, entity = identity.split("/")[:2]
+            source = session, int(entity)
+        except ValueError:
+            return
+        if token.kind != zenoh.SampleKind.PUT or parse_key(key) is None:
+            return
         if self._reliable:
-            # A query waits for Zenoh's tables, which Zenoh holds while it waits for room in the channel.
-            asking = map(self._ask, iter(self._questions.get, None))
-            threading.Thread(target=deque, args=(asking, 0), name=f"recovery {key}").start()
+            self._backfill.appeared(source, key)
+        else:
+            self._questions.put(RecoveryQuery(source, key, 0, NEWEST, None, 0))
 
     def _collect(self, channel: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """Queue what arrives, until the subscription is closed.
@@ -222,6 +241,13 @@ class ZenohSubscription(InboxSubscription):
                 self.inbox.count_skipped(number - newest - 1)
             self._newest[publisher] = number
 
+    def _take_latest(self, source: _Source, key: str, number: int, payload: bytes) -> None:
+        """Take the history of a topic of which only the newest message matters."""
+        with self._turn:
+            if self._newest.get((key, source), -1) < number:
+                self._newest[key, source] = number
+                self._push(source, key, payload)
+
     def _push(self, source: _Source, key: str, payload: bytes) -> None:
         self._arrived.append((key, payload, self._clock_ns(), source[0], source is not _PLAIN))
 
@@ -233,8 +259,11 @@ class ZenohSubscription(InboxSubscription):
         def answer(reply: zenoh.Reply) -> None:
             sample = reply.ok
             if sample is not None and sample.source_info is not None:
-                number = sample.source_info.source_sn
-                self._backfill.answer(question, number, str(sample.key_expr), sample.payload.to_bytes())
+                number, key = sample.source_info.source_sn, str(sample.key_expr)
+                if self._reliable:
+                    self._backfill.answer(question, number, key, sample.payload.to_bytes())
+                elif key == question.key:
+                    self._take_latest(source, key, number, sample.payload.to_bytes())
 
         def witnessed(reply: zenoh.Reply) -> None:
             nonlocal served
@@ -246,13 +275,14 @@ class ZenohSubscription(InboxSubscription):
                 still_open -= 1
                 ended = still_open == 0
             if ended:
-                self._backfill.finish(question, served)
+                if self._reliable:
+                    self._backfill.finish(question, served)
                 self.inbox.push_all(self._arrived)
 
         def get(low: int, high: int, take: Callable[[zenoh.Reply], None]) -> None:
             with zenoh_call(f"fetch {question.key}"):
                 self._session.get(
-                    f"{question.key}/@adv/pub/{source[0]}/{source[1]}/**?_sn={low}..{high}",
+                    f"{question.key}{_ADVANCED}{source[0]}/{source[1]}/**?_sn={low}..{high}",
                     zenoh.handlers.Callback(take, drop=done),
                     consolidation=zenoh.ConsolidationMode.NONE,
                     accept_replies=zenoh.ReplyKeyExpr.ANY,
@@ -279,7 +309,7 @@ class ZenohSubscription(InboxSubscription):
 
     def close(self) -> None:
         """Undeclare: a process with an open subscription never exits."""
-        undeclare_all(self._subscriber)
+        undeclare_all(self._publishers, self._subscriber)
         self._questions.put(None)
         self._keys.close()
 

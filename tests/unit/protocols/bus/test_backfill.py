@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocols.bus.transport.backfill import GAP_TIMEOUT_S, JOIN_TIMEOUT_S, RETRY_S, Backfill, RecoveryQuery
+from protocols.bus.transport.backfill import GAP_TIMEOUT_S, JOIN_TIMEOUT_S, NEWEST, RETRY_S, Backfill, RecoveryQuery
 
 
 class Stage:
@@ -50,6 +50,50 @@ def test_who_begins_at_the_beginning_is_not_asked() -> None:
     stage.take("a", 0, 1, 2, 3)
     assert stage.out == names(0, 1, 2, 3)
     assert stage.asked == []
+
+
+def test_who_appears_is_asked_for_all_it_has() -> None:
+    stage = Stage()
+    stage.backfill.appeared("a", "key-a")
+    assert [(q.low, q.high, q.witness) for q in stage.asked] == [(0, NEWEST, None)]
+    stage.take("a", 6, 7)
+    assert stage.out == [], "it waits for what came before"
+    stage.answer(3, 4, 5, 6)
+    assert stage.out == names(3, 4, 5, 6, 7), "each once, from the oldest that is cached"
+    stage.take("a", 8)
+    assert (stage.out[-1], len(stage.asked), stage.lost) == ("a8", 1, 0)
+
+
+def test_who_appears_with_nothing_yet_is_heard_from_its_first_message() -> None:
+    for first in (0, 5):
+        stage = Stage()
+        stage.backfill.appeared("a", "key-a")
+        stage.answer()
+        stage.take("a", first)
+        if first:
+            assert stage.asked[-1].high == first - 1, "nothing was there then; now there is"
+            stage.answer()
+        assert (stage.out, stage.lost) == (names(first), 0)
+
+
+def test_who_appears_again_is_asked_for_what_is_new() -> None:
+    """After an outage, of a publisher that says nothing any more: no gap shows what is missing."""
+    stage = Stage()
+    stage.take("a", 0, 1, 2)
+    stage.backfill.appeared("a", "key-a")
+    assert (stage.asked[-1].low, stage.asked[-1].high) == (3, NEWEST)
+    stage.take("a", 5)
+    stage.answer(3, 4)
+    assert stage.out == names(0, 1, 2, 3, 4, 5)
+    stage.backfill.appeared("a", "key-a")
+    stage.after(JOIN_TIMEOUT_S + 0.1)
+    stage.take("a", 6)
+    assert (stage.out[-1], stage.lost) == ("a6", 0), "also where no answer comes"
+    stage.backfill.appeared("a", "key-a")
+    stage.answer(10, 11)
+    assert (stage.asked[-1].low, stage.asked[-1].high, stage.asked[-1].witness) == (7, 10, 11)
+    stage.answer(10)
+    assert (stage.out[-2:], stage.lost) == (["a10", "a11"], 3), "what the cache no longer has is counted"
 
 
 def test_what_came_before_is_fetched_once_and_put_first() -> None:
@@ -200,6 +244,20 @@ def test_invented_publishers_of_one_key_are_forgotten_first() -> None:
     assert len(stage.backfill._next) < 20
     stage.take("a", 2)
     assert stage.out[-1] == "a2"
+
+
+def test_a_forged_number_while_a_publisher_is_asked_silences_nobody() -> None:
+    for cached in ((), range(495, 500)):
+        stage = Stage()
+        stage.backfill.appeared("a", "key-a")
+        stage.take("a", 2**31 - 5)
+        stage.take("a", 500, 501)
+        stage.answer(*cached)
+        stage.take("a", 502)
+        stage.after(GAP_TIMEOUT_S + 0.1)
+        stage.take("a", 503)
+        delivered = [name for name in stage.out if int(name[1:]) < 1000]
+        assert delivered == names(*cached, *range(500, 504))
 
 
 def test_a_forged_number_before_the_first_message_silences_nobody() -> None:
