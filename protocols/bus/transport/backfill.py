@@ -34,10 +34,8 @@ from typing import Generic, TypeVar
 
 _Source = TypeVar("_Source", bound=Hashable)
 
-JOIN_TIMEOUT_S = 3.0
-"""After this a late joiner's messages are delivered even without a reply of the publisher."""
 GAP_TIMEOUT_S = 30.0
-"""The same for a gap: the missing messages then count as lost."""
+"""After this the missing messages of a gap count as lost."""
 RETRY_S = 0.3
 """Pause between two queries for one gap."""
 _MAX_SOURCES, _MAX_OF_KEY = 16_384, 16
@@ -86,7 +84,8 @@ class Backfill(Generic[_Source]):
     """Reorders and completes the messages in front of an inbox; may be called from any thread.
 
     push: called with (source, key, payload) of each message in sequence. ask: called with a query; its replies go to
-    ``answer``, then ``finish``. lost: called with the number of messages that are lost for good.
+    ``answer``, then ``finish``, which is called also where there are none. lost: called with the number of messages
+    that are lost for good.
     """
 
     def __init__(
@@ -170,7 +169,7 @@ class Backfill(Generic[_Source]):
         with self._lock:
             for who, held in list(self._held.items()):
                 too_much = held.bytes > _MAX_BYTES_OF_KEY or self._bytes > _MAX_BYTES
-                if too_much or now - held.since > (JOIN_TIMEOUT_S if held.joining else GAP_TIMEOUT_S):
+                if too_much or (not held.joining and now - held.since > GAP_TIMEOUT_S):
                     follow = self._release(who)
                 elif held.due is not None and now >= held.due:
                     follow = self._question(who, held)
@@ -194,13 +193,13 @@ class Backfill(Generic[_Source]):
             if held.joining and behind and held.later and held.later[0][0] == held.first:
                 # A publisher's numbers arrive in order: what came first was another's.
                 self._bytes -= self._held.pop(who).bytes
-                return self._begin(who, number, payload, held.since)
+                return self._begin(who, number, payload)
             held.later.append((number, payload))
             self._keep(held, len(payload))
             return None
         if expected is None:
             self._remember(who)
-            return self._begin(who, number, payload, self._clock())
+            return self._begin(who, number, payload)
         if (number - expected) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2:
             return None
         if number < expected:  # a gap at the wrap-around of the sequence numbers: once in years
@@ -210,17 +209,13 @@ class Backfill(Generic[_Source]):
             return None
         return self._hold(who, expected, number, payload, joining=False)
 
-    def _begin(
-        self, who: tuple[str, _Source], number: int, payload: bytes, since: float
-    ) -> RecoveryQuery[_Source] | None:
-        """The first message of a publisher that was not known; since: when that was."""
+    def _begin(self, who: tuple[str, _Source], number: int, payload: bytes) -> RecoveryQuery[_Source] | None:
+        """The first message of a publisher that was not known."""
         if number == 0:
             self._next[who] = 1
             self._push(who[1], who[0], payload)
             return None
-        question = self._hold(who, 0, number, payload, joining=True)
-        self._held[who].since = since
-        return question
+        return self._hold(who, 0, number, payload, joining=True)
 
     def _hold(
         self, who: tuple[str, _Source], low: int, first: int, payload: bytes | None = None, *, joining: bool

@@ -87,9 +87,21 @@ def test_a_gap_that_zenoh_gave_up_is_asked_for_until_the_cache_has_answered(monk
         assert subscription.counters["lost"] == 0
 
 
+def test_the_histories_of_more_publishers_than_are_asked_at_once_arrive() -> None:
+    with connected() as (sending, receiving):
+        cameras = [f"cam{number:02d}" for number in range(40)]
+        publishers = [sending.publisher(OBSERVATION, camera) for camera in cameras]
+        for index in range(30):
+            for camera, publisher in zip(cameras, publishers, strict=True):
+                publisher.put(observation(camera, index))
+        received = collect(receiving.subscribe(OBSERVATION), 1200)
+        for camera in cameras:
+            assert sequences([item for item in received if item.agent == camera]) == list(range(30))
+
+
 def test_messages_are_taken_while_a_query_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Zenoh held its tables while the channel was full, a query waited for them, and nobody emptied the channel."""
-    take, freed, lost = ZenohSubscription._take, threading.Event(), list[int]()
+    take, ask, freed, lost = ZenohSubscription._take, ZenohSubscription._ask, threading.Event(), list[int]()
 
     def with_a_gap(self: ZenohSubscription, sample: zenoh.Sample) -> object:
         if sample.source_info is not None and sample.source_info.source_sn == 5 and not lost:
@@ -97,7 +109,9 @@ def test_messages_are_taken_while_a_query_waits(monkeypatch: pytest.MonkeyPatch)
         return take(self, sample)
 
     monkeypatch.setattr(ZenohSubscription, "_take", with_a_gap)
-    monkeypatch.setattr(ZenohSubscription, "_ask", lambda self, question: freed.wait(20.0))
+    monkeypatch.setattr(
+        ZenohSubscription, "_ask", lambda self, asked: freed.wait(20.0) if asked.witness else ask(self, asked)
+    )
     with connected() as (sending, receiving):
         subscription = receiving.subscribe(OBSERVATION)
         first, second = (matched(sending.publisher(OBSERVATION, f"cam{number}")) for number in range(2))
