@@ -18,6 +18,7 @@ from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.ground.photometric import contrast_table
 from edge.uav.ground_tracker import GroundTracker
+from edge.uav.image_motion.repeated_images import is_repeated
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Image
@@ -32,6 +33,7 @@ _CHECK_EVERY = 3  # frames between two looks of the appearance tracker while the
 _CALM = 0.5  # step in the image, in target lengths, above which the appearance tracker looks at every frame
 _COMPLETE = 0.9  # share of a box in the image from which the appearance can learn it
 _RETRY_S = 4.0  # after which the ground is tried again; doubles each time
+_REPEATED_S = 1.0  # of one image, after which its target is not seen any more, as a camera's is then reported as frozen
 _ATTITUDE = "the attitude says that the camera looks down"
 
 
@@ -62,13 +64,15 @@ class AdaptiveTracker:
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
         assert self._ground is not None
+        self._viewed, self._viewed_at = image, time
         self._contrast = contrast_table(image)
         image = self._stretched(image)
         first = self._ground.begin(image, time, target)
         seen = self._appearance.begin(image, time, target)
         self._steep = self._looks_down(self._ground)
         self._cut = not self._is_complete(target)
-        return self._on_ground(first) if self._steep else self._on_image(seen)
+        self._last = self._on_ground(first) if self._steep else self._on_image(seen)
+        return self._last
 
     def handle_telemetry(self, sample: Telemetry) -> None:
         """Add one sample; without lens and mounting it is not used."""
@@ -77,7 +81,19 @@ class AdaptiveTracker:
             self._ground.handle_telemetry(sample)
 
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
-        """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
+        """Track the target into the next frame; ``None`` for a frame that could not be decoded.
+
+        An image that repeats one with the target has that one's estimate: it says nothing of the time since.
+        """
+        if image is not None and self._last.state is TrackState.VISIBLE and is_repeated(self._viewed, image):
+            recent = time - self._viewed_at <= _REPEATED_S
+            return replace(self._last, time=time, state=TrackState.VISIBLE if recent else TrackState.COASTING)
+        if image is not None:
+            self._viewed, self._viewed_at = image, time
+        self._last = self._follow(image, time)
+        return self._last
+
+    def _follow(self, image: Image | None, time: float) -> Estimate:
         self._frame += 1
         image = None if image is None else self._stretched(image)
         if self._ground is None:

@@ -163,7 +163,7 @@ def _fixed_batch(inputs: dict[str, list[int | str]], size: tuple[int, int], file
     (shape,) = inputs.values()
     fixed = [one if isinstance(one, int) and one > 0 else 0 for one in shape]
     written = "x".join(str(one or "?") for one in shape)[:80]
-    if len(fixed) != 4 or fixed[1] not in (0, 3):
+    if len(fixed) != 4 or fixed[1] not in (0, 3) or fixed[3] == 3:  # 3 last: height x width x channels
         what = f"the model's input is {written or 'one number'}"
         raise InputError(what, file=file, remedy="export it with an input of images, batch x 3 x height x width")
     if any(given not in (0, wanted) for given, wanted in zip(fixed[2:], (size[1], size[0]), strict=True)):

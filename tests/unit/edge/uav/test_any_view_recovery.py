@@ -430,3 +430,29 @@ def test_two_places_under_test_that_come_to_one_are_no_rivals() -> None:
     search._test = lambda *of: True  # type: ignore[method-assign]
     search._search = lambda *of: None  # type: ignore[method-assign]
     assert search.look(np.zeros((SIZE[1], SIZE[0], 3), np.uint8), expected, 1.0 / FPS) is not None
+
+
+@pytest.mark.parametrize("seconds", [0.6, 2.0])
+def test_images_repeated_while_a_link_stalls_do_not_stop_the_target(scene: Image, seconds: float) -> None:
+    """The view and the target, which stood in them, jumped after them, and it was looked for where it had stood.
+
+    The repeated images differ by what an encoder changes in them. After a second, the target is not seen any more.
+    """
+    tracker, rng = AdaptiveTracker(SIZE, None, None, FPS), np.random.default_rng(3)
+
+    def view(k: int) -> tuple[Image, np.ndarray]:
+        place = np.array([60.0 + 1.5 * k, 110.0 + 0.5 * k])
+        return painted(scene[:, 3 * k :], place), place
+
+    image, place = view(0)
+    tracker.begin(image, 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
+    stalled = range(30, 30 + round(seconds * FPS))
+    for k in range(1, 75):
+        if k not in stalled:
+            image, place = view(k)
+        change = rng.choice([-1, 0, 1], image.shape, p=[0.05, 0.9, 0.05])
+        coded = np.asarray(np.clip(image + change, 0, 255), np.uint8)
+        found = tracker.handle_frame(coded, k / FPS)
+        late = k in stalled and k > 29 + FPS + 1e-6
+        assert found.state is (TrackState.COASTING if late else TrackState.VISIBLE), k
+        assert np.hypot(found.x - place[0], found.y - place[1]) < 6.0, k

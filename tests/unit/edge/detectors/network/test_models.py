@@ -99,6 +99,7 @@ def of_huge_outputs(numbers: int) -> onnx.ModelProto:
         (with_loop(), "a Loop, whose duration is not bounded"),
         (two_inputs(), r"2 inputs \(images, sizes\)"),
         (of_input([1, 3]), "the model's input is 1x3;"),
+        (of_input(["b", "h", "w", 3]), "images, batch x 3 x height x width"),
         (of_input(["n", 1, 48, 64]), "nx1x48x64"),
         (of_input(["n", 3, 480, 640]), r"set input = \[640, 480\]"),
         (of_input([20000, 3, 48, 64]), "20000 images at once"),
