@@ -192,6 +192,7 @@ def _deeplabcut(file: Path, camera: str, rows: _Rows, least: float) -> None:
         raise InputError("coords are not x, y, likelihood", file=file, line=head, remedy="export it again")
     if len(parts) != width or (people is not None and len(people) != width):
         raise InputError("header rows of different lengths", file=file, line=head, remedy="export it again")
+    begin, best = len(rows.camera), -1.0
     for line, cells in table[head:]:
         if len(cells) != width:
             raise InputError(f"{len(cells)} columns of {width}", file=file, line=line, remedy="complete the row")
@@ -205,6 +206,7 @@ def _deeplabcut(file: Path, camera: str, rows: _Rows, least: float) -> None:
                 if has_likelihood and cells[column + 2].strip()
                 else 1.0
             )
+            best = max(best, score)
             if not score >= least:
                 continue
             part = parts[column].strip()
@@ -213,6 +215,9 @@ def _deeplabcut(file: Path, camera: str, rows: _Rows, least: float) -> None:
             rows.frame.append(frame)
             rows.pixels.append((_pixel(cells[column], "x", file, line), _pixel(cells[column + 1], "y", file, line)))
             rows.line.append(line)
+    if len(rows.camera) == begin and best >= 0.0:
+        remedy = "import with a smaller --likelihood, or train the tracker on such images"
+        raise InputError(f"no point's likelihood reaches {least:g}, the best is {best:g}", file=file, remedy=remedy)
 
 
 def _mvus(file: Path, camera: str, rows: _Rows) -> None:
@@ -239,7 +244,8 @@ def _table(file: Path) -> list[tuple[int, list[str]]]:
     try:
         for cells in reader:
             if any(cell.strip() for cell in cells):
-                out.append((reader.line_num, cells))
+                # What is missing is an empty cell, or NaN as numpy and MATLAB write it.
+                out.append((reader.line_num, ["" if cell.strip().lower() == "nan" else cell for cell in cells]))
     except csv.Error as error:
         raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
     if len(out) < 2:

@@ -345,6 +345,22 @@ coords,x,y,likelihood,x,y,likelihood
 """
 
 
+def test_points_that_are_not_a_number_are_missing(tmp_path: Path) -> None:
+    file, out = tmp_path / "left.csv", tmp_path / "o.csv"
+    file.write_text(DEEPLABCUT.replace("10.5,20.5,0.99", "NaN,NaN,NaN"))
+    assert run(["import", str(file), "--fps", "50", "--out", str(out)]) == 0
+    assert [line.split(",")[1] for line in out.read_text().splitlines()[1:]] == ["1", "1"]
+
+
+def test_points_below_the_least_likelihood_are_refused_with_the_option(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "left.csv"
+    file.write_text(DEEPLABCUT)
+    arguments = ["import", str(file), "--fps", "50", "--likelihood", "0.995", "--out", str(tmp_path / "o.csv")]
+    assert "reaches 0.995, the best is 0.99; import with a smaller --likelihood" in refusal(capsys, arguments)
+
+
 def test_deeplabcuts_likely_points_become_labels_at_the_frames_times(tmp_path: Path) -> None:
     file = tmp_path / "leftDLC_resnet50_shuffle1.csv"
     file.write_text(DEEPLABCUT)
