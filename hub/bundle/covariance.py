@@ -387,23 +387,22 @@ def equivalent_std(axes: Floats) -> Floats:
 
 
 def inverse_blocks(band: Floats) -> Floats:
-    """Blocks (k, 2 w, 2 w) of the inverse of a banded matrix, of which ``band`` (w, n) is the upper band, about its
-    diagonal, by block recursion.
+    """Blocks (k, 24, 24) of the inverse of a banded matrix about its diagonal, by block recursion.
 
-    Block i covers rows w i … w i + 2 w - 1: every w neighbouring rows lie in one of them.
+    Block i covers rows 12 i … 12 i + 23: every 12 neighbouring rows lie in one of them.
     """
-    width, size = band.shape
-    count = -(-size // width)
-    diagonal = np.tile(np.eye(width), (count, 1, 1))
-    above = np.zeros((count, width, width))
-    for distance in range(width):
+    size = band.shape[1]
+    count = -(-size // BAND)
+    diagonal = np.tile(np.eye(BAND), (count, 1, 1))
+    above = np.zeros((count, BAND, BAND))
+    for distance in range(BAND):
         column = np.arange(distance, size)
         row = column - distance
-        values = band[width - 1 - distance, distance:]
-        same = row // width == column // width
-        diagonal[row[same] // width, row[same] % width, column[same] % width] = values[same]
-        diagonal[row[same] // width, column[same] % width, row[same] % width] = values[same]
-        above[row[~same] // width, row[~same] % width, column[~same] % width] = values[~same]
+        values = band[BAND - 1 - distance, distance:]
+        same = row // BAND == column // BAND
+        diagonal[row[same] // BAND, row[same] % BAND, column[same] % BAND] = values[same]
+        diagonal[row[same] // BAND, column[same] % BAND, row[same] % BAND] = values[same]
+        above[row[~same] // BAND, row[~same] % BAND, column[~same] % BAND] = values[~same]
     on_diagonal = np.einsum("kii->ki", diagonal)
     on_diagonal += regularisation(on_diagonal.ravel()).reshape(on_diagonal.shape)
     return BlockTridiagonal.of(diagonal, above, definite=False).inverse_blocks()

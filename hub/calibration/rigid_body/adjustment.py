@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solveh_banded
+from scipy.linalg import cho_factor, cho_solve, solveh_banded
 
 from hub.bundle.adjustment import apply_camera_step
 from hub.bundle.bordered_system import third_differences
@@ -31,57 +31,41 @@ from hub.calibration.rigid_body.linear_system import (
     assemble,
     camera_priors,
     linearised_rows,
-    local_blocks,
     view_index,
 )
-from hub.calibration.rigid_body.noise import mark_inliers, noise, scatters, variance_components
+from hub.calibration.rigid_body.noise import jitters, mark_inliers, noise, scatters, shape_stds
 from hub.calibration.rigid_body.problem import POSE, BodyMotion, BodyProblem, BodyState, frame_interval, rotated
+from hub.trajectory.discrete import PointBasis
 from hub.trajectory.splines import SUPPORT, SplineBasis
-from protocols.geometry.types import Floats
+from protocols.geometry.types import Floats, Ints
 from protocols.session.calibration import AdjustmentStep
 
-_LEAST_ROUNDS, _MOST_ROUNDS, _STEPS = 4, 15, 20  # of noise estimates; Levenberg-Marquardt steps in each
-_SETTLED = 0.02  # relative change of the variance components at which their estimates have converged
+_ROUNDS, _STEPS = 5, 20  # of noise estimates; Levenberg-Marquardt steps in each
 _TOLERANCE = 1e-5  # relative decrease of the cost at which it has converged
 
 _CLUSTER_VIEWS, _CLUSTER_S = 3, 0.5
 """Views, and seconds, whose errors count as one."""
+_WINDOW = 4  # control points on each side that the std of a pose is computed from
 
 
 def adjust_bodies(problem: BodyProblem, state: BodyState) -> tuple[BodyProblem, BodyState]:
     """The adjusted state, and the problem with the rows that fit marked."""
-    for round_ in range(_MOST_ROUNDS):
-        if round_ < 2:
-            state = replace(state, scatter=scatters(state))
-        state = _round(problem, state, robust=True)
-        if round_ < 1:
-            continue
-        before, state = state, variance_components(problem, state)
-        # Frames that come evenly have no time errors: what was fitted to noise must not stay.
-        shifts = zip(state.shift, state.jitter, strict=True)
-        state = replace(state, shift=tuple(shift if std > 0.0 else np.zeros(len(shift)) for shift, std in shifts))
-        if round_ + 1 >= _LEAST_ROUNDS and _settled(before, state):
-            break
-    problem = mark_inliers(problem, state)
-    return problem, _round(problem, state, robust=False)
-
-
-def _round(problem: BodyProblem, state: BodyState, robust: bool) -> BodyState:
-    """The state of least cost, and the noise that it leaves."""
-    state = _minimise(problem, state, robust)
-    state = replace(state, sigma=noise(problem, state))
-    step = AdjustmentStep("robust" if robust else "fitting rows", float(np.sqrt(np.mean(state.sigma**2))))
-    return replace(state, steps=(*state.steps, step))
-
-
-def _settled(before: BodyState, after: BodyState) -> bool:
-    """Whether the stds of time errors and of the paths' third differences have converged."""
-    both = zip(_components(before), _components(after), strict=True)
-    return all(np.allclose(one, other, rtol=_SETTLED) for one, other in both)
-
-
-def _components(state: BodyState) -> list[Floats]:
-    return [state.jitter, *(one for one in state.scatter if one is not None)]
+    for round_ in range(_ROUNDS):
+        robust = round_ < _ROUNDS - 1
+        state = replace(state, scatter=scatters(state))
+        state = _minimise(problem, state, robust)
+        state = replace(state, sigma=noise(problem, state))
+        stage = "robust" if robust else "fitting rows"
+        rms = float(np.sqrt(np.mean(state.sigma**2)))
+        state = replace(state, steps=(*state.steps, AdjustmentStep(stage, rms)))
+        if 1 <= round_ < _ROUNDS - 1:
+            state = replace(state, jitter=jitters(problem, state), shape_std=shape_stds(problem, state))
+            # Frames that come evenly have no time errors: what was fitted to noise must not stay.
+            shifts = zip(state.shift, state.jitter, strict=True)
+            state = replace(state, shift=tuple(shift if std > 0.0 else np.zeros(len(shift)) for shift, std in shifts))
+        if round_ == _ROUNDS - 2:
+            problem = mark_inliers(problem, state)
+    return problem, replace(state, sigma=noise(problem, state))
 
 
 def _minimise(problem: BodyProblem, state: BodyState, robust: bool) -> BodyState:
@@ -230,31 +214,50 @@ def _gradient_scatter(problem: BodyProblem, state: BodyState, terms: list[ViewTe
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathCovariance:
-    """Covariance of a body's path, with the cameras as they are. first: its first parameter among all bodies'. blocks:
-    ``ReducedSystem.inverse_blocks`` of all paths."""
+    """Covariances (i, 28, 28) of a body's path by knot interval, with the cameras as they are. index: (i,) sorted
+    first control points of the intervals that have one."""
 
     motion: BodyMotion
-    first: int
+    index: Ints
     blocks: Floats
 
     def point_stds(self, point: Floats, time: Floats) -> Floats:
-        """Stds (n,) of one axis of a point (3,) of the body at internal times (n,)."""
+        """Stds (n,) of one axis of a point (3,) of the body at internal times (n,) within these intervals."""
         at, weights, _, _ = self.motion.support(time)
         pose = np.einsum("nk,nkp->np", weights, self.motion.control[at[:, None] + np.arange(SUPPORT)])
         by_quaternion = rotated(pose[:, 3:], np.tile(point, (len(time), 1)))[1]
         jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(time), 3, 3)), by_quaternion], axis=2)
         by_path = (weights[:, None, :, None] * jacobian[:, :, None, :]).reshape(len(time), 3, BLOCK)
-        variance = (
-            np.einsum(
-                "nip,npq,niq->n", by_path, local_blocks(self.blocks, self.first + POSE * at), by_path, optimize=True
-            )
-            / 3.0
-        )
+        blocks = self.blocks[np.searchsorted(self.index, at)]
+        variance = np.einsum("nip,npq,niq->n", by_path, blocks, by_path, optimize=True) / 3.0
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def path_covariances(state: BodyState, covariance: BodyCovariance) -> list[PathCovariance]:
-    """The covariance of each body's path."""
-    blocks = covariance.inflation**2 * covariance.system.inverse_blocks()
-    starts = np.r_[0, np.cumsum([body.control.size for body in state.bodies])]
-    return [PathCovariance(body, int(first), blocks) for body, first in zip(state.bodies, starts, strict=False)]
+def path_covariance(state: BodyState, covariance: BodyCovariance, body: int, time: Floats) -> PathCovariance:
+    """The path's covariances in the knot intervals of internal times (n,), each from a window of the path around it."""
+    motion = state.bodies[body]
+    first = sum(len(one.control) for one in state.bodies[:body])
+    reach = 0 if isinstance(motion.basis, PointBasis) else _WINDOW
+    index = np.unique(motion.support(time)[0])
+    blocks = np.zeros((len(index), BLOCK, BLOCK))
+    for number, at in enumerate(index.tolist()):
+        low, high = max(at - reach, 0), min(at + SUPPORT + reach, len(motion.control))
+        window = _dense(covariance.system.band, POSE * (first + low), POSE * (first + high))
+        begin = POSE * (at - low)
+        unit = np.eye(len(window))[:, begin : begin + BLOCK]
+        try:
+            blocks[number] = cho_solve(cho_factor(window, lower=True), unit)[begin : begin + BLOCK]
+        except np.linalg.LinAlgError:
+            blocks[number] = np.diag(np.full(BLOCK, np.inf))
+    return PathCovariance(motion, index, covariance.inflation**2 * blocks)
+
+
+def _dense(band: Floats, begin: int, end: int) -> Floats:
+    """The diagonal block of a symmetric matrix in lower banded form."""
+    size = end - begin
+    out = np.zeros((size, size))
+    for below in range(min(band.shape[0], size)):
+        values = band[below, begin : end - below]
+        out[np.arange(below, size), np.arange(size - below)] = values
+        out[np.arange(size - below), np.arange(below, size)] = values
+    return out

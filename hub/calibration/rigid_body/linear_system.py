@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hub.bundle.bordered_system import THIRD_DIFFERENCE, third_difference_gradient, third_differences
-from hub.bundle.covariance import inverse_blocks
 from hub.bundle.problem import Column
 from hub.bundle.residuals import ResidualEvaluation, SplineSupport, evaluate_points, jacobians
 from hub.calibration.rigid_body.lag import rotations
@@ -57,13 +56,6 @@ class ReducedSystem:
     corner: Floats
     gradient_path: Floats
     gradient_cameras: Floats
-
-    def inverse_blocks(self) -> Floats:
-        """Blocks (k, 56, 56) of the paths' covariance with the cameras as they are: ``covariance.inverse_blocks``."""
-        upper = np.zeros_like(self.band)
-        for distance, values in enumerate(self.band):
-            upper[BLOCK - 1 - distance, distance:] = values[: len(values) - distance]
-        return inverse_blocks(upper)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,12 +123,6 @@ def _support(problem: BodyProblem, state: BodyState, camera: int) -> tuple[Ints,
             index[mine] = at + first
         first += len(body.control)
     return index, weights, slopes, inside
-
-
-def local_blocks(blocks: Floats, index: Ints) -> Floats:
-    """Covariances (n, 28, 28) of the path's parameters from each of ``index`` (n,) on, of ``inverse_blocks``."""
-    local = (index % BLOCK)[:, None] + np.arange(BLOCK)
-    return np.asarray(blocks[(index // BLOCK)[:, None, None], local[:, :, None], local[:, None, :]])
 
 
 def assemble(problem: BodyProblem, state: BodyState, rows: list[CameraRows]) -> tuple[ReducedSystem, list[ViewTerms]]:

@@ -11,7 +11,7 @@ from hub.bundle.datum.gauge import fix_gauge
 from hub.bundle.initialisation import SEEN_WITHIN_S, seen_by_two
 from hub.bundle.problem import CAMERA_PARAMETERS, Column
 from hub.calibration.notes import jitter_notes, readout_notes
-from hub.calibration.rigid_body.adjustment import BodyCovariance, body_covariance, path_covariances
+from hub.calibration.rigid_body.adjustment import BodyCovariance, body_covariance, path_covariance
 from hub.calibration.rigid_body.lag import BodyPair
 from hub.calibration.rigid_body.noise import residuals
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval
@@ -188,7 +188,6 @@ def _trajectories(
     owner = {label: (number, point) for number, body in enumerate(rig.bodies.values()) for label, point in body.items()}
     seen = sorted({int(number) for views in solution.problem.views for number in np.unique(views.body)})
     order = {number: i for i, number in enumerate(seen)}
-    paths = path_covariances(state, covariance)
     for number, place in order.items():
         motion = state.bodies[place]
         within = SEEN_WITHIN_S
@@ -200,6 +199,7 @@ def _trajectories(
             step = max(1.0 / rate, (last - first) / _MAX_SAMPLES)
             ticks = np.arange(np.ceil(first / step), np.floor(last / step) + 1) * step
         internal = base.reference_time(ticks - origin)
+        path = path_covariance(state, covariance, place, internal)
         for index, label in enumerate(solution.labels):
             if owner[label][0] != number:
                 continue
@@ -209,7 +209,7 @@ def _trajectories(
             finite = np.isfinite(position).all(axis=1)
             time, inside = ticks[good][finite], internal[good][finite]
             if len(time):
-                std = world.scale * paths[place].point_stds(point, inside)
+                std = world.scale * path.point_stds(point, inside)
                 out.append(TrajectoryTable(label, time, world.points(position[finite]), std))
     return tuple(out)
 

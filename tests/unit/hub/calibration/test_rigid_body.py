@@ -12,7 +12,6 @@ from hub.calibration.pipeline import calibrate
 from hub.calibration.rigid_body.problem import rotated
 from protocols.core.errors import Refused
 from protocols.geometry import so3
-from protocols.geometry.types import Floats
 from protocols.session.calibration import Calibration, read_calibration
 from protocols.session.rig import Rig
 from tests.support.board_session import BoardWorld, board_world
@@ -93,27 +92,6 @@ def test_time_errors_of_single_frames_are_estimated() -> None:
     for place, turn, _ in errors(world, found).values():
         assert place < 0.005
         assert turn < 0.15
-
-
-class _TurnedBoard(BoardWorld):
-    """It shows itself to one camera for five seconds and turns to the other within one."""
-
-    def board(self, time: float) -> tuple[Floats, Floats]:
-        turn, place = super().board(time)
-        count, phase = divmod(time, 6.0)
-        share = min(max(phase - 5.0, 0.0), 1.0)
-        side = (-1.0) ** count * (1.0 - 2.0 * share**2 * (3.0 - 2.0 * share))
-        return so3.exp(np.array([0.0, 0.0, -side - 0.45])) @ turn, place
-
-
-@pytest.mark.parametrize("seed", [2, 5])
-def test_frames_that_come_evenly_have_no_time_errors_where_one_camera_alone_sees_the_board(seed: int) -> None:
-    world = board_world(seed, (10.0, 6.0))
-    world = _TurnedBoard(world.cameras, world.points, world.motion, world.facing)
-    found = calibrate(world.rig(), world.observations(30.0, readout=0.02))
-    camera, lag = found.cameras["cam1"], errors(world, found)["cam1"][2]
-    assert camera.lag_std < 3e-4
-    assert abs(lag) < 4.0 * camera.lag_std
 
 
 def test_a_board_of_unknown_size_gives_no_scale() -> None:
