@@ -10,7 +10,7 @@ from typing import Any
 
 from edge.mavlink.dialect import AUTOPILOT, CAMERA, camera_heartbeat, mavlink, message_name
 from edge.mavlink.link.connection import Link, ReceivedMessage
-from edge.mavlink.roles.camera_messages import STREAM_ID, CameraMessages, TrackingStatus, VideoStream
+from edge.mavlink.roles.camera_messages import STREAM_ID, UNKNOWN_INT, CameraMessages, TrackingStatus, VideoStream
 from edge.mavlink.roles.message_rates import MessageRates
 from protocols.geometry.camera import Intrinsics
 
@@ -315,5 +315,6 @@ class _AcknowledgedCommand:
 
 def _parameters(message: Any) -> tuple[float, ...]:
     if message.get_type() == "COMMAND_INT":
-        return (message.param1, message.param2, message.param3, message.param4, float(message.x), float(message.y))
+        x, y = (math.nan if value == UNKNOWN_INT else float(value) for value in (message.x, message.y))
+        return message.param1, message.param2, message.param3, message.param4, x, y
     return (message.param1, message.param2, message.param3, message.param4, message.param5, message.param6)

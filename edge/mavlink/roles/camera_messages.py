@@ -14,7 +14,7 @@ from edge.mavlink.dialect import mavlink
 from protocols.geometry.camera import Intrinsics
 
 NAN = float("nan")
-_UNKNOWN_INT = 0x7FFFFFFF  # INT32_MAX: the protocol's "not known"
+UNKNOWN_INT = 0x7FFFFFFF  # INT32_MAX: the protocol's "not known"
 _MAX_ALTITUDE_M = 2e6  # more does not fit into millimetres of 32 bits
 _MODEL = b"Syncline UAV tracker"
 STREAM_ID = 1
@@ -189,7 +189,7 @@ class CameraMessages:
     def _camera_fov_status(self) -> Any:
         status, (hfov, vfov) = self.status, self.fov
         camera, image = _scaled_position(status.camera), _scaled_position(status.image_centre)
-        heights = [round(1e3 * place[2]) if place[0] != _UNKNOWN_INT else _UNKNOWN_INT for place in (camera, image)]
+        heights = [round(1e3 * place[2]) if place[0] != UNKNOWN_INT else UNKNOWN_INT for place in (camera, image)]
         return mavlink.MAVLink_camera_fov_status_message(
             status.boot_ms,
             *camera[:2],
@@ -213,5 +213,5 @@ _STATUS_FLAGS = {
 def _scaled_position(geo: tuple[float, float, float] | None) -> tuple[int, int, float]:
     """Latitude, longitude in 1e-7 degrees and altitude [m]; INT32_MAX and NaN where unknown or impossible."""
     if geo is None or not (abs(geo[0]) <= 90.0 and abs(geo[1]) <= 180.0 and abs(geo[2]) < _MAX_ALTITUDE_M):
-        return _UNKNOWN_INT, _UNKNOWN_INT, NAN
+        return UNKNOWN_INT, UNKNOWN_INT, NAN
     return round(1e7 * geo[0]), round(1e7 * geo[1]), geo[2]

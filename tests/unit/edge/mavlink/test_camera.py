@@ -197,6 +197,21 @@ def test_a_retransmitted_command_is_acknowledged_again_but_not_executed_again() 
     assert len(commands) == 2
 
 
+def test_a_command_int_that_names_no_camera_is_for_this_one() -> None:
+    """Its x and y are integers, of which INT32_MAX is not set."""
+    chosen: list[OperatorCommand] = []
+    under_test = CameraUnderTest(lambda command: chosen.append(command) is None)
+    unset = 0x7FFFFFFF
+    for command, corners in (
+        (mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, (0.25, 0.25, 0.5, 0.5)),
+        (mavlink.MAV_CMD_CAMERA_TRACK_POINT, (0.5, 0.5, 0.0, float("nan"))),
+    ):
+        message = mavlink.MAVLink_command_int_message(1, 100, 0, command, 0, 0, *corners, unset, unset, 0.0)
+        (ack,) = [one for one in under_test.send(message) if one.get_type() == "COMMAND_ACK"]
+        assert ack.result == mavlink.MAV_RESULT_ACCEPTED
+    assert len(chosen) == 2
+
+
 @pytest.mark.parametrize(
     ("command", "before"),
     [
