@@ -64,9 +64,9 @@ class AdaptiveTracker:
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
         assert self._ground is not None
-        self._viewed, self._viewed_at = image, time
         self._contrast = contrast_table(image)
         image = self._stretched(image)
+        self._viewed, self._viewed_at = image, time
         first = self._ground.begin(image, time, target)
         seen = self._appearance.begin(image, time, target)
         self._steep = self._looks_down(self._ground)
@@ -85,6 +85,7 @@ class AdaptiveTracker:
 
         An image that repeats one with the target has that one's estimate: it says nothing of the time since.
         """
+        image = None if image is None else self._stretched(image)
         if image is not None and self._last.state is TrackState.VISIBLE and is_repeated(self._viewed, image):
             recent = time - self._viewed_at <= _REPEATED_S
             return replace(self._last, time=time, state=TrackState.VISIBLE if recent else TrackState.COASTING)
@@ -95,7 +96,6 @@ class AdaptiveTracker:
 
     def _follow(self, image: Image | None, time: float) -> Estimate:
         self._frame += 1
-        image = None if image is None else self._stretched(image)
         if self._ground is None:
             return self._without_ground(image, time)
         ground = self._ground.handle_frame(image, time)

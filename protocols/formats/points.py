@@ -146,7 +146,8 @@ def _caliscope(file: Path, rows: _Rows, times: Times) -> None:
     if missing or ids is None or of_point is None:
         remedy = "give caliscope's xy_….csv or image_points.csv"
         raise InputError(f"column {', '.join(missing)} is missing", file=file, line=1, remedy=remedy)
-    whole = [cells for _, cells in table[1:] if len(cells) == len(header)]
+    at = place["img_loc_x"], place["img_loc_y"]
+    whole = [row for _, row in table[1:] if len(row) == len(header) and not _is_missing(row[at[0]], row[at[1]])]
     timed = "frame_time" in place and all(cells[place["frame_time"]].strip() for cells in whole)
     objects = len({cells[place["object_id"]] for cells in whole}) if "object_id" in place else 1
     begin = len(rows.camera)
@@ -154,7 +155,7 @@ def _caliscope(file: Path, rows: _Rows, times: Times) -> None:
     for line, cells in table[1:]:
         if len(cells) < len(header):
             raise InputError(f"{len(cells)} columns of {len(header)}", file=file, line=line, remedy="complete the row")
-        if not cells[place["img_loc_x"]].strip() or not cells[place["img_loc_y"]].strip():
+        if _is_missing(cells[at[0]], cells[at[1]]):
             continue
         port = _whole(cells[place[ids]], ids, file, line)
         u, v = (_pixel(cells[place[name]], name, file, line) for name in ("img_loc_x", "img_loc_y"))
@@ -198,14 +199,12 @@ def _deeplabcut(file: Path, camera: str, rows: _Rows, least: float) -> None:
             raise InputError(f"{len(cells)} columns of {width}", file=file, line=line, remedy="complete the row")
         frame = _frame(cells[starts[0] - 1], file, line)  # of labelled images, folder and file are two columns
         for column in starts:
-            if not cells[column].strip() or not cells[column + 1].strip():
+            if _is_missing(cells[column], cells[column + 1]):
                 continue
             has_likelihood = column + 2 < width and coords[column + 2] == "likelihood"
-            score = (
-                _number(cells[column + 2], "likelihood", file, line)
-                if has_likelihood and cells[column + 2].strip()
-                else 1.0
-            )
+            likelihood = cells[column + 2].strip() if has_likelihood else ""
+            unknown = 0.0 if likelihood else 1.0  # NaN is of a point that was not found
+            score = unknown if _is_missing(likelihood) else _number(likelihood, "likelihood", file, line)
             best = max(best, score)
             if not score >= least:
                 continue
@@ -238,14 +237,18 @@ def _mvus(file: Path, camera: str, rows: _Rows) -> None:
         rows.line.append(line)
 
 
+def _is_missing(*cells: str) -> bool:
+    """Whether one of some cells is empty, or NaN as numpy and MATLAB write it."""
+    return any(cell.strip().lower() in ("", "nan") for cell in cells)
+
+
 def _table(file: Path) -> list[tuple[int, list[str]]]:
     reader = csv.reader(io.StringIO(read_text(file)), strict=True)
     out: list[tuple[int, list[str]]] = []
     try:
         for cells in reader:
             if any(cell.strip() for cell in cells):
-                # What is missing is an empty cell, or NaN as numpy and MATLAB write it.
-                out.append((reader.line_num, ["" if cell.strip().lower() == "nan" else cell for cell in cells]))
+                out.append((reader.line_num, cells))
     except csv.Error as error:
         raise InputError(f"not CSV: {error}", file=file, line=reader.line_num, remedy="correct this row") from None
     if len(out) < 2:

@@ -29,7 +29,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
-from operator import itemgetter
 from typing import Generic, TypeVar
 
 _Source = TypeVar("_Source", bound=Hashable)
@@ -254,27 +253,20 @@ class Backfill(Generic[_Source]):
             # The numbers went on where they had been: what was far ahead of them was another's.
             self._next[who] = held.low
             return None
-        if held.joining and held.low and held.early:  # after an outage: a gap before the newest, like any other
-            first = max(held.early)
-            question = self._hold(who, held.low, first, held.early.pop(first), joining=False)
-            gap = self._held[who]
-            gap.early, gap.later = held.early, gap.later + held.later
-            self._keep(gap, held.bytes)
-            return self._release(who) if len(gap.early) == first - gap.low else question
-        for _, message in sorted(held.early.items()):
-            self._push(source, key, message)
-        missing = held.first - held.low - len(held.early)
-        if missing and not held.joining:
-            self._lost(missing)
         expected = held.first
         if held.joining:
-            # What a late joiner heard first is its publisher's only if the cache has what was before it.
-            held.later = deque(sorted(held.later, key=itemgetter(0)))  # a publisher's own arrive in order
-            begin = held.low or next((number for number, _ in held.later), None)
-            if not held.early and begin is None:  # nothing yet: what comes first is a late joiner's still
-                del self._next[who]
+            # All in order, and from the first missing one on as after any gap: a cache has none, and what is far ahead
+            # is another's. A late joiner begins with the oldest, whoever was known where its messages had ended.
+            held.later = deque(sorted((dict(held.later) | held.early).items()))
+            if not held.low and not held.later:  # nothing yet: what comes first is a late joiner's still
+                self._forget(who)
                 return None
-            expected = max(held.early, default=(begin or 0) - 1) + 1
+            expected = held.low or held.later[0][0]
+        else:
+            for _, message in sorted(held.early.items()):
+                self._push(source, key, message)
+            if missing := held.first - held.low - len(held.early):
+                self._lost(missing)
         while held.later:
             number, payload = held.later.popleft()
             behind = (number - expected) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2

@@ -91,9 +91,21 @@ def test_who_appears_again_is_asked_for_what_is_new() -> None:
     assert (stage.out[-1], stage.lost) == ("a6", 0), "also where no answer came"
     stage.backfill.appeared("a", "key-a")
     stage.answer(10, 11)
-    assert (stage.asked[-1].low, stage.asked[-1].high, stage.asked[-1].witness) == (7, 10, 11)
-    stage.answer(10)
+    assert (stage.asked[-1].low, stage.asked[-1].high, stage.asked[-1].witness) == (7, 9, 10)
+    stage.answer()
     assert (stage.out[-2:], stage.lost) == (["a10", "a11"], 3), "what the cache no longer has is counted"
+
+
+def test_a_reply_far_ahead_of_the_history_silences_nobody() -> None:
+    stage = Stage()
+    stage.backfill.appeared("a", "key-a")
+    stage.take("a", 8)
+    stage.answer(5, 6, 7, NEWEST - 1)
+    assert stage.out == names(5, 6, 7, 8)
+    stage.take("a", 9)
+    stage.after(GAP_TIMEOUT_S + 0.1)
+    stage.take("a", 10)
+    assert stage.out == names(5, 6, 7, 8, 9, 10)
 
 
 def test_what_came_before_is_fetched_once_and_put_first() -> None:
