@@ -345,9 +345,10 @@ coords,x,y,likelihood,x,y,likelihood
 """
 
 
-def test_points_that_are_not_a_number_are_missing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("cells", ["NaN,NaN,NaN", "10.5,20.5,nan"])
+def test_points_that_are_not_a_number_are_missing(tmp_path: Path, cells: str) -> None:
     file, out = tmp_path / "left.csv", tmp_path / "o.csv"
-    file.write_text(DEEPLABCUT.replace("10.5,20.5,0.99", "NaN,NaN,NaN"))
+    file.write_text(DEEPLABCUT.replace("10.5,20.5,0.99", cells))
     assert run(["import", str(file), "--fps", "50", "--out", str(out)]) == 0
     assert [line.split(",")[1] for line in out.read_text().splitlines()[1:]] == ["1", "1"]
 
