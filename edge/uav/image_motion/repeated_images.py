@@ -10,7 +10,7 @@ import numpy as np
 
 from protocols.geometry.types import Image
 
-_ROWS = 64  # px: one row of so many tells nearly every pair apart
+_ROWS = 64  # px: one row of so many distinguishes nearly all pairs
 _BLOCK = 16  # px: the smallest target is seen in the mean of such a block
 _MEAN_CHANGE, _MOST_CHANGE = 0.4, 7
 """Grey levels, of the image and of any block's mean. What H.264 makes of a repeated image differs by 0.00 to 0.27 and

@@ -255,7 +255,7 @@ class Backfill(Generic[_Source]):
             return None
         expected = held.first
         if held.joining:
-            # All in order, and from the first missing one on as after any gap: a cache has none, and what is far ahead
+            # In order, and from the first missing one on as after any gap: a cache has no gaps, and what is far ahead
             # is another's. A late joiner begins with the oldest, whoever was known where its messages had ended.
             held.later = deque(sorted((dict(held.later) | held.early).items()))
             if not held.low and not held.later:  # nothing yet: what comes first is a late joiner's still
