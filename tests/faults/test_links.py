@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import socket
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
+from protocols.bus.router.zenoh_router import Router, free_endpoint
+from protocols.bus.settings import BusConfig
+from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.topics import OBSERVATION
 from tests.faults.matrix import measured
 from tests.faults.processes import Link, Process, bad_link, publisher, receiver, router, rows
+from tests.support.receiving import collect, sequences
+from tests.support.samples import observation
 
 ENDPOINT = "tcp/10.99.0.2:7447"
 Ends = tuple[Process, Process, Link]
@@ -113,3 +121,50 @@ def test_a_bad_link_loses_nothing(ends: Ends, name: str, rules: dict[str, float]
         flowing <= 3.0,
     )
     assert sequences == list(range(put))
+
+
+@contextmanager
+def slow_link(endpoint: str, bytes_per_s: float) -> Iterator[str]:
+    """An endpoint in front of another, from which bytes come no faster."""
+
+    def forward(source: socket.socket, sink: socket.socket, pause_s: float) -> None:
+        with suppress(OSError):
+            while data := source.recv(1400):
+                time.sleep(pause_s * len(data))
+                sink.sendall(data)
+        sink.close()
+
+    def accept() -> None:
+        with suppress(OSError):
+            while True:
+                near = listening.accept()[0]
+                far = socket.create_connection(("127.0.0.1", int(endpoint.rsplit(":", 1)[1])))
+                for end in (near, far):
+                    end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16_384)
+                threading.Thread(target=forward, args=(near, far, 0.0), daemon=True).start()
+                threading.Thread(target=forward, args=(far, near, 1.0 / bytes_per_s), daemon=True).start()
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=accept, daemon=True).start()
+        yield f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+
+
+def test_a_late_joiner_over_a_slow_link_gets_the_whole_history() -> None:
+    """1.2 MB at 300 kB/s."""
+    endpoint = free_endpoint()
+    with Router(endpoint), open_bus("local", BusConfig(mode="client", connect=(endpoint,))) as sending:
+        publisher = sending.publisher(OBSERVATION, "cam0")
+        for index in range(600):
+            publisher.put(observation("cam0", index, points=12))
+        with slow_link(endpoint, 3e5) as slow, open_bus("local", BusConfig(mode="client", connect=(slow,))) as bus:
+            begun = time.monotonic()
+            subscription = bus.subscribe(OBSERVATION)
+            received = collect(subscription, 600, 40.0)
+            measured(
+                "late joiner, 600 messages over 300 kB/s",
+                "0 lost",
+                f"{600 - len(received)} lost, {time.monotonic() - begun:.1f} s",
+                True,
+            )
+            assert sequences(received) == list(range(600))
+            assert subscription.counters["lost"] == 0

@@ -146,13 +146,16 @@ class Backfill(Generic[_Source]):
                 self._keep(held, len(payload))
 
     def finish(self, query: RecoveryQuery[_Source], served: bool) -> None:
-        """Process the end of a query's replies. served: its witness was among them."""
+        """Process the end of a query's replies. served: its witness was among them; of a history, nothing failed."""
         who = query.key, query.source
         with self._lock:
             held = self._held.get(who)
             if held is None or held.question != query.number:
                 return
-            if held.joining or served or len(held.early) == held.first - held.low:
+            if held.joining and not served and max(held.early, default=-1) >= query.low:
+                # A slow link: it goes on where its time was up.
+                follow: RecoveryQuery[_Source] | None = self._question(who, held)
+            elif held.joining or served or len(held.early) == held.first - held.low:
                 follow = self._release(who)
             else:
                 held.due, follow = self._clock() + RETRY_S, None
@@ -242,7 +245,8 @@ class Backfill(Generic[_Source]):
         held.question, held.due = self._questions, None
         # The newest one: by the time of the reply the cache may have dropped older ones.
         witness = None if held.joining else held.later[-1][0]
-        return RecoveryQuery(who[1], who[0], held.low, held.first - 1, witness, held.question)
+        low = max(held.early, default=held.low - 1) + 1 if held.joining else held.low  # a cache answers in order
+        return RecoveryQuery(who[1], who[0], low, held.first - 1, witness, held.question)
 
     def _release(self, who: tuple[str, _Source]) -> RecoveryQuery[_Source] | None:
         """Deliver everything in order up to the next gap, and return the query for that gap."""

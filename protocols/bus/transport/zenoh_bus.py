@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 import traceback
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from queue import SimpleQueue
@@ -18,7 +18,7 @@ from google.protobuf.message import Message
 
 from protocols.bus.base import BusDead, Received
 from protocols.bus.settings import BusConfig
-from protocols.bus.transport.backfill import NEWEST, Backfill, RecoveryQuery
+from protocols.bus.transport.backfill import GAP_TIMEOUT_S, NEWEST, Backfill, RecoveryQuery
 from protocols.bus.transport.inbox import Arrived, InboxSubscription, LivenessTracker, subscription_key
 from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
 from protocols.core.closing import Closing
@@ -29,10 +29,10 @@ from protocols.validation.codec import encode, message_class, parse_key, unknown
 HEARTBEAT_S = 0.5
 """Period after which a subscriber detects that the last message before a pause is missing."""
 _POLL_S = 0.005  # for a matching subscriber
-_HISTORY_QUERY_S = 2.0  # the publisher's messages wait for it
 _HISTORIES_AT_ONCE, _HISTORIES_OF_KEY = 16, 2
 """In all, and of one key: who does not answer delays no other. Of 200 publishers 1,000 messages each took 2.4 s
 with 1 to 16 at once; with 64 and more the link stalled for seconds, and queries ended without a reply."""
+_HISTORY_TURN_S = 2.0  # after it a query for a history counts no more among them: its publisher is slow, or silent
 _GAP_QUERY_S = 10.0  # a third of GAP_TIMEOUT_S: three queries before it is lost
 _CHANNEL, _AT_ONCE = 512, 256
 """Samples between Zenoh and a subscription's thread, 3 ms of a flood: while it is full, Zenoh waits. And of these taken
@@ -156,7 +156,8 @@ class ZenohSubscription(InboxSubscription):
         self._backfill: Backfill[_Source] = Backfill(self._push, self._questions.put, self.inbox.count_lost)
         self._histories: deque[RecoveryQuery[_Source]] = deque()
         """Queries that wait until another one has ended."""
-        self._open_histories: Counter[str] = Counter()
+        self._open_histories: dict[int, tuple[str, float]] = {}
+        """Key and time of the begin of each query for a history, by its number."""
         self._counting = threading.Lock()
         self._newest: dict[tuple[str, _Source], int] = {}
         self._keys = _DeclaredKeys(session)
@@ -274,7 +275,7 @@ class ZenohSubscription(InboxSubscription):
                 if not self._may_ask(question):
                     self._histories.append(question)
                     return
-                self._open_histories[question.key] += 1
+                self._open_histories[question.number] = question.key, time.monotonic()
 
         # Zenoh calls its method directly: with a function in Python in between, all took twice as long.
         replies: deque[zenoh.Reply] = deque(maxlen=_MAX_REPLIES)
@@ -284,17 +285,16 @@ class ZenohSubscription(InboxSubscription):
             served = served or reply.ok is not None
 
         def done() -> None:
-            nonlocal still_open
-            self._read(question, replies)
+            nonlocal still_open, served
+            complete = self._read(question, replies)
             with lock:
+                served = served or (history and complete)
                 still_open -= 1
                 if still_open:
                     return
-                if history:
-                    self._open_histories -= Counter((question.key,))
-                    if (following := next(filter(self._may_ask, self._histories), None)) is not None:
-                        self._histories.remove(following)
-                        self._questions.put(following)
+                self._open_histories.pop(question.number, None)
+            if history:
+                self._ask_next()
             if self._reliable:
                 self._backfill.finish(question, served)
             self.inbox.push_all(self._arrived)
@@ -306,7 +306,7 @@ class ZenohSubscription(InboxSubscription):
                     zenoh.handlers.Callback(take, drop=done, indirect=False),
                     consolidation=zenoh.ConsolidationMode.NONE,
                     accept_replies=zenoh.ReplyKeyExpr.ANY,
-                    timeout=_HISTORY_QUERY_S if question.witness is None else _GAP_QUERY_S,
+                    timeout=GAP_TIMEOUT_S if question.witness is None else _GAP_QUERY_S,
                 )
 
         try:
@@ -319,23 +319,37 @@ class ZenohSubscription(InboxSubscription):
             self.inbox.push_all(self._arrived)
 
     def _may_ask(self, question: RecoveryQuery[_Source]) -> bool:
-        mine = self._open_histories[question.key]
-        return mine < _HISTORIES_OF_KEY and self._open_histories.total() < _HISTORIES_AT_ONCE
+        begun = time.monotonic() - _HISTORY_TURN_S
+        keys = [key for key, since in self._open_histories.values() if since > begun]
+        return keys.count(question.key) < _HISTORIES_OF_KEY and len(keys) < _HISTORIES_AT_ONCE
 
-    def _read(self, question: RecoveryQuery[_Source], replies: deque[zenoh.Reply]) -> None:
+    def _ask_next(self) -> None:
+        """Of the queries that wait, the first whose turn it is."""
+        with self._counting:
+            if (following := next(filter(self._may_ask, self._histories), None)) is not None:
+                self._histories.remove(following)
+                self._questions.put(following)
+
+    def _read(self, question: RecoveryQuery[_Source], replies: deque[zenoh.Reply]) -> bool:
+        """Take the replies; whether none is an error, as Zenoh's when the time is up."""
+        complete = True
         while replies:
             sample = replies.popleft().ok
+            complete = complete and sample is not None
             if sample is not None and sample.source_info is not None:
                 number, key = sample.source_info.source_sn, str(sample.key_expr)
                 if self._reliable:
                     self._backfill.answer(question, number, key, sample.payload.to_bytes())
                 elif key == question.key:
                     self._take_latest(question.source, key, number, sample.payload.to_bytes())
+        return complete
 
     def drain(self) -> list[Received]:
         """Everything since the last call."""
         self._keys.declare()
         self._backfill.poll()
+        if self._histories:
+            self._ask_next()
         if self._arrived:
             self.inbox.push_all(self._arrived)
         with self._turn:

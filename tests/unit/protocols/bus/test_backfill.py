@@ -115,7 +115,7 @@ def test_what_came_before_is_fetched_once_and_put_first() -> None:
     stage.take("b", 0)
     assert stage.out == ["b0"], "others do not wait"
     stage.take("a", 5)
-    stage.answer(2, 0, 1, 3, served=False)
+    stage.answer(2, 0, 1, 3)
     stage.take("a", 6)
     assert stage.out == ["b0", *names(0, 1, 2, 3, 4, 5, 6)]
     assert len(stage.asked) == 1
@@ -279,7 +279,7 @@ def test_a_forged_number_before_the_first_message_silences_nobody() -> None:
     stage.take("a", 500, 501)
     stage.take("a", 2**31 + 1)
     stage.after(0.5)
-    stage.answer(*range(495, 500), served=False)  # what the camera's cache still has
+    stage.answer(*range(495, 500))  # what the camera's cache still has
     stage.take("a", 502)
     stage.after(GAP_TIMEOUT_S + 0.1)
     stage.take("a", 503, 504)
@@ -290,6 +290,30 @@ def test_a_forged_number_before_the_first_message_silences_nobody() -> None:
 def test_a_forged_number_alone_does_not_outlast_what_the_camera_has_published() -> None:
     stage = Stage()
     stage.take("a", 2**31)
-    stage.answer(0, 1, 2, served=False)
+    stage.answer(0, 1, 2)
     stage.take("a", 3, 4)
     assert stage.out == names(0, 1, 2, 3, 4)
+
+
+def test_a_history_whose_time_is_up_goes_on_where_it_stopped() -> None:
+    """A slow link, where all of it takes longer than one query may."""
+    stage = Stage()
+    stage.backfill.appeared("a", "key-a")
+    stage.take("a", 7)
+    stage.answer(2, 3, 4, served=False)
+    assert (stage.out, [query.low for query in stage.asked]) == ([], [0, 5])
+    stage.answer(5, served=False)
+    assert stage.asked[-1].low == 6
+    stage.answer(6)
+    assert (stage.out, len(stage.asked), stage.lost) == (names(2, 3, 4, 5, 6, 7), 3, 0)
+
+
+def test_a_history_that_brings_nothing_more_is_not_waited_for() -> None:
+    stage = Stage()
+    stage.backfill.appeared("a", "key-a")
+    stage.take("a", 5)
+    stage.answer(2, 3, served=False)
+    stage.answer(served=False)
+    assert stage.out == names(2, 3)
+    stage.answer(4)  # and what is then missing is a gap like any other
+    assert (stage.out, stage.lost) == (names(2, 3, 4, 5), 0)
