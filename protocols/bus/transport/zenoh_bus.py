@@ -160,6 +160,8 @@ class ZenohSubscription(InboxSubscription):
         """Key and time of the begin of each query for a history, by its number."""
         self._counting = threading.Lock()
         self._newest: dict[tuple[str, _Source], int] = {}
+        self._fetched: dict[tuple[str, _Source], int] = {}
+        """Number of the message that was taken from a publisher's cache; it may yet arrive by itself."""
         self._keys = _DeclaredKeys(session)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         with zenoh_call(f"subscribe {key}"):
@@ -243,7 +245,7 @@ class ZenohSubscription(InboxSubscription):
         if self._reliable:
             return name, source.source_sn, key, payload
         self._count_gap((key, name), source.source_sn)
-        return name, None, key, payload
+        return (name, None, key, payload) if self._fetched.get((key, name)) != source.source_sn else None
 
     def _count_gap(self, publisher: tuple[str, _Source], number: int) -> None:
         """Count the losses of a topic that is not recovered."""
@@ -259,7 +261,7 @@ class ZenohSubscription(InboxSubscription):
         """Take the history of a topic of which only the newest message matters."""
         with self._turn:
             if self._newest.get((key, source), -1) < number:
-                self._newest[key, source] = number
+                self._newest[key, source] = self._fetched[key, source] = number
                 self._push(source, key, payload)
 
     def _push(self, source: _Source, key: str, payload: bytes) -> None:
