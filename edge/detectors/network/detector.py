@@ -80,7 +80,9 @@ class NetworkDetector:
             inputs = [one for one, _ in part]
             inputs += [inputs[-1]] * (self._runtime.batch - len(inputs))
             outputs = self._runtime.run(np.stack(inputs))
-            boxes = decode(outputs, self._description, len(inputs), self._options.kind, self._file)
+            boxes = decode(
+                outputs, self._description, len(inputs), self._options.kind, self._file, self._runtime.classes
+            )
             found += [(one, resize) for one, (_, resize) in zip(boxes, part, strict=False)]
         return found
 
