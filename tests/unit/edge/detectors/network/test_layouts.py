@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from onnx import helper, numpy_helper
 
-from edge.detectors.base import Detection
+from edge.detectors.base import BatchDetector, Detection
 from edge.detectors.network.decode import decode
 from edge.detectors.network.description import NetworkDescription
 from edge.detectors.plugins import load_detector
@@ -211,8 +212,6 @@ def test_classes_that_the_model_names_have_to_fit_the_layout(
     [("n", 4, "auto"), (3, 3, "auto"), (1, 1, "auto"), (3, 3, "opencv"), ("n", 1, "opencv")],
 )
 def test_a_batch_gives_what_single_images_give(tmp_path: Path, batch: int | str, size: int, backend: str) -> None:
-    from edge.detectors.base import BatchDetector
-
     file = write_network(
         tmp_path, constant_model(OUTPUTS['layout = "yolov8"'], batch), f'backend = "{backend}"', CLASSES
     )
@@ -223,6 +222,18 @@ def test_a_batch_gives_what_single_images_give(tmp_path: Path, batch: int | str,
     together = detector.detect_batch([IMAGE] * 5, times)
     alone = load_detector(file)
     assert together == [alone.detect(IMAGE, time) for time in times]
+
+
+def test_a_model_that_takes_one_image_though_it_declares_any_number_gets_one(tmp_path: Path) -> None:
+    """It was refused after the first image, with advice about its input."""
+    model = constant_model(OUTPUTS['layout = "yolov8"'])
+    shape = numpy_helper.from_array(np.array([1, 3, 48, 64]), "one")
+    model.graph.initializer.append(shape)
+    model.graph.node[0].input[0] = "image"
+    model.graph.node.insert(0, helper.make_node("Reshape", ["images", "one"], ["image"]))
+    detector = load_detector(write_network(tmp_path, model, "", CLASSES))
+    assert isinstance(detector, BatchDetector)
+    assert [len(found) for found in detector.detect_batch([IMAGE] * 3, [0.0, 0.1, 0.2])] == [2, 2, 2]
 
 
 @pytest.mark.parametrize(
