@@ -105,6 +105,20 @@ def decode(
     ]
 
 
+def check_grey(outputs: Mapping[str, Array], description: NetworkDescription, images: int, file: Path) -> None:
+    """Raise InputError where the outputs for empty images show that the activation is not the layout's usual one.
+
+    With softmax nearly all candidates are then *no object*, the last class; a model without that class has none there.
+    """
+    if description.layout == "detr" and description.activation is None:
+        scores = _parts(outputs, description, images, file)["scores"]
+        nothing = float((scores.argmax(axis=-1) == scores.shape[-1] - 1).mean()) if scores.size else 1.0
+        if nothing < 0.5:
+            what = f'of an empty image {100.0 * nothing:.0f} % of the candidates are "no object", the last class'
+            remedy = 'set activation = "sigmoid" in the network\'s .toml file, or "softmax" if this is right'
+            raise InputError(what, file=file, remedy=remedy)
+
+
 def _parts(outputs: Mapping[str, Array], description: NetworkDescription, images: int, file: Path) -> dict[str, Array]:
     """The outputs by role, each (images, N, ...)."""
     layout = description.layout

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from edge.detectors.base import Detection, DetectorOptions, Prediction
 from edge.detectors.network.boxes import BoxLabeller, NetworkBox, seen_keypoints
-from edge.detectors.network.decode import Boxes, decode
+from edge.detectors.network.decode import Boxes, check_grey, decode
 from edge.detectors.network.description import NetworkDescription, read_description
 from edge.detectors.network.runtime import Runtime, open_runtime
 from protocols.core.clocks import NANOSECONDS
@@ -44,7 +44,7 @@ class NetworkDetector:
         self._labeller = BoxLabeller(options.prefix, description.box_std)
         self._time = -1.0 / options.fps
         self.batch = runtime.batch or description.batch
-        self._singly = False
+        self._singly = self._checked = False
         width, height = description.input
         self._infer([np.full((height, width, 3), description.fill, dtype=np.uint8)])
 
@@ -93,6 +93,9 @@ class NetworkDetector:
             inputs = [one for one, _ in part]
             inputs += [inputs[-1]] * (self._runtime.batch - len(inputs))
             outputs = self._runtime.run(np.stack(inputs))
+            if not self._checked:
+                check_grey(outputs, self._description, len(inputs), self._file)
+                self._checked = True
             boxes = decode(
                 outputs, self._description, len(inputs), self._options.kind, self._file, self._runtime.classes
             )

@@ -67,8 +67,8 @@ OUTPUTS = {
     'layout = "yolov8"\nmask_coefficients = 2': {"output0": np.hstack([table(False), np.full((94, 2), 7.0)]).T[None]},
     'layout = "end2end"': {"output0": [[lone(PERSON, 0.9, 0), lone(TRUCK, 0.6, 2), lone(PERSON, 0.8, 1)]]},
     'layout = "detr"': {
-        "logits": LOGITS[None],
-        "pred_boxes": np.array([PERSON, TRUCK, PERSON])[None] / SIZE4,
+        "logits": np.vstack([LOGITS, LOGITS[2:]])[None],
+        "pred_boxes": np.array([PERSON, TRUCK, PERSON, PERSON])[None] / SIZE4,
     },
     'layout = "detr"\nactivation = "sigmoid"\noutputs = { scores = "a", boxes = "b" }': {
         "a": np.array([[[2.197, -9.0, -9.0], [-9.0, -9.0, 0.405], [-9.0, 3.0, -9.0]]]),
@@ -122,7 +122,7 @@ WITH_KEYPOINTS = {
         "o": np.array([[*PERSON, 0.9, *KEYPOINTS]] + [[*PERSON, 0.0, *KEYPOINTS]] * 20).T[None]
     },
     'layout = "end2end"': {"o": [[lone(PERSON, 0.9, 0, *KEYPOINTS)]]},
-    'layout = "detr"': {
+    'layout = "detr"\nactivation = "softmax"': {
         "logits": LOGITS[None, :1],
         "pred_boxes": PERSON[None, None] / SIZE4,
         "keypoints": (np.array(KEYPOINTS).reshape(1, 1, 3, 3) / [64.0, 48.0, 1.0]),
@@ -267,6 +267,8 @@ def test_what_the_image_border_cuts_is_not_measured(
         ('layout = "end2end"', {"o": np.zeros((1, 50, 7))}, "do not fit"),
         ('layout = "yolox"', {"o": np.zeros((1, 50, 8))}, "do not fit"),
         ('layout = "detr"', {"o": np.zeros((1, 50, 4))}, "no output 'logits' for scores; its outputs are o 1x50x4"),
+        ('layout = "detr"', {"logits": np.full((1, 50, 80), -5.0), "pred_boxes": np.ones((1, 50, 4))},
+         'of an empty image 0 % of the candidates are "no object".*set activation = "sigmoid"'),
         ('layout = "separate"', {"boxes": np.zeros((1, 5, 4)), "scores": np.zeros((1, 6)), "labels": np.zeros((1, 5))},
          "do not fit"),
         ('outputs = { boxes = "o" }', {"o": np.zeros((1, 7, 50))}, "outputs.boxes has no meaning"),
