@@ -168,7 +168,7 @@ def detect(
         )
     if not found.rows:
         remedy = (
-            "a lower `score` in its file may find more, if its `classes`, `box` and `pixels` are those of the model"
+            "a lower `score` in its file may find more, if its `layout`, `classes`, `box` and `pixels` are the model's"
             if detector
             else _REMEDIES[mode if mode in _REMEDIES else what]
         )

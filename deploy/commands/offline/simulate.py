@@ -40,7 +40,8 @@ def simulate(
 
     Scene town:SCENARIO is a drone that follows a car until it leaves the view: video.mp4, rig.toml, telemetry.csv and
     truth.csv (the car in every frame, also out of view). Scenarios: exit-bend (the default), exit-straight,
-    turn-out-of-view, yaw, distractors, trees, bridge, lighting, off-road, partial, paper-3.3, paper-4.4.
+    turn-out-of-view, yaw, distractors, trees, bridge, lighting, off-road, partial, cut, climb, far,
+    paper-3.3, paper-4.4.
 
     Example: syncline simulate marker --cameras 5 --seed 3 --out my-session
 

@@ -26,7 +26,10 @@ _LEAST_RATE = 0.5  # of the requested rate: one message in two may be lost
 
 @dataclass
 class Heard:
-    """What was heard on a link. samples: times of attitudes [s]. stations: ids of ground stations' heartbeats."""
+    """What was heard on a link. samples: times of attitudes [s]. stations: ids of ground stations' heartbeats.
+
+    conflict: what else is on it. gimbal: whether one reports. ignores_unsigned: see ``Vehicle``.
+    """
 
     firmware: str = "the autopilot"
     samples: list[float] = field(default_factory=list)
@@ -34,6 +37,9 @@ class Heard:
     stations: set[int] = field(default_factory=set)
     parameters: dict[str, float] = field(default_factory=dict)
     refusal: str = ""
+    conflict: str = ""
+    gimbal: bool = False
+    ignores_unsigned: bool = False
 
 
 def check(config: Any, patience_s: float = 3.0, listen_s: float = 2.5) -> Iterator[CheckResult]:
@@ -68,7 +74,8 @@ def check(config: Any, patience_s: float = 3.0, listen_s: float = 2.5) -> Iterat
         if found.verdict == "ok":
             gimbal = config.mount == "gimbal"
             heard = listen(link, hello, gimbal=gimbal, rate_hz=settings.rate_hz, seconds=listen_s)
-            yield telemetry(heard, gimbal=gimbal, rate_hz=settings.rate_hz, signs=link.counters["signed"] > 0)
+            yield telemetry(heard, gimbal=gimbal, rate_hz=settings.rate_hz)
+            yield from unused(heard, link.vehicle, gimbal=gimbal)
             yield ground_station(heard)
     finally:
         link.close()
@@ -140,16 +147,18 @@ def listen(link: Any, hello: Any, *, gimbal: bool, rate_hz: float, seconds: floa
                     firmware = {mavlink.MAV_AUTOPILOT_PX4: "PX4", mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot"}
                     heard.firmware, before = firmware.get(message.autopilot, heard.firmware), heard.firmware
                     due = elapsed if heard.firmware != before else due
+                heard.gimbal |= received.kind == "GIMBAL_DEVICE_ATTITUDE_STATUS"
                 heard.samples += [sample.host_ns / NANOSECONDS for sample in vehicle.handle(received)]
         link.wait(0.05)
     heard.synchronised = vehicle.clock.answered
-    heard.refusal = vehicle.problem(time.monotonic_ns())
+    heard.ignores_unsigned = vehicle.ignores_unsigned
+    heard.refusal, heard.conflict = vehicle.problem(time.monotonic_ns()), link.report(time.monotonic_ns())
     return heard
 
 
-def telemetry(heard: Heard, *, gimbal: bool, rate_hz: float, signs: bool = False) -> CheckResult:
-    """Check the rate of attitudes, and that the autopilot answers. signs: it signs, though no key is configured."""
-    if signs and not heard.synchronised:
+def telemetry(heard: Heard, *, gimbal: bool, rate_hz: float) -> CheckResult:
+    """Check the rate of attitudes, and that the autopilot answers."""
+    if heard.ignores_unsigned:
         return misconfigured(
             "telemetry", f"{heard.firmware} signs its messages and ignores unsigned ones", "set key in [mavlink]"
         )
@@ -176,6 +185,16 @@ def telemetry(heard: Heard, *, gimbal: bool, rate_hz: float, signs: bool = False
     if rate < _LEAST_RATE * rate_hz:
         return warn("telemetry", text, "a faster port (921600 baud), or a lower rate_hz in [mavlink]")
     return ok("telemetry", text)
+
+
+def unused(heard: Heard, followed: int | None, *, gimbal: bool) -> Iterator[CheckResult]:
+    """Warn of another vehicle, and of a gimbal, where neither is used and the settings may have meant it."""
+    if heard.conflict:
+        remedy = "set vehicle in [mavlink] to the system that carries the camera"
+        yield warn("vehicle", f"system {followed} is followed; {heard.conflict}", remedy)
+    if heard.gimbal and not gimbal:
+        remedy = 'set mount = "gimbal" if the camera hangs on it'
+        yield warn("gimbal", 'a gimbal reports its attitude, which mount = "fixed" does not use', remedy)
 
 
 def ground_station(heard: Heard) -> CheckResult:

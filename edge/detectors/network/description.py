@@ -12,7 +12,7 @@ from msgspec import Meta
 from protocols.core.errors import InputError
 from protocols.core.files import read_toml
 
-Layout = Literal["yolov5", "yolov8", "end2end", "detr", "separate"]
+Layout = Literal["yolov5", "yolov8", "yolox", "end2end", "detr", "separate"]
 BoxFormat = Literal["cxcywh", "xyxy", "xywh"]
 Activation = Literal["none", "sigmoid", "softmax"]
 
@@ -36,7 +36,8 @@ class NetworkDescription(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
     the input or in fractions of it; default: of the layout. activation: turns the class scores into probabilities.
     classes: kind by class index; others are ignored. keypoints: their names in order, COCO's for example; those of
     face, shoulders, hips and ankles refine head, foot and colour. keypoint_values: 3 = u, v, confidence; 2 = u, v.
-    score, nms: least score; greatest overlap (intersection over union) of two objects of a kind, 1 = none removed.
+    mask_coefficients: of each candidate, behind everything else; not used. score, nms: least score; greatest overlap
+    (intersection over union) of two objects of a kind, 1 = none removed; default: of the layout.
     box_std: std of a box's centre over its side. batch: images at once. threads: of the processor. backend: auto takes
     onnxruntime if it is installed, else OpenCV.
     """
@@ -57,8 +58,9 @@ class NetworkDescription(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
     classes: dict[Annotated[str, Meta(pattern=r"^[0-9]{1,4}\Z")], Literal["person", "vehicle"]]
     keypoints: Annotated[tuple[Annotated[str, Meta(min_length=1, max_length=64)], ...], Meta(max_length=200)] = ()
     keypoint_values: Literal[2, 3] = 3
+    mask_coefficients: Annotated[int, Meta(ge=0, le=1024)] = 0
     score: _Fraction = 0.25
-    nms: _Fraction = 0.6
+    nms: _Fraction | None = None
     box_std: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.05
     batch: Annotated[int, Meta(ge=1, le=32)] = 4
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
@@ -69,6 +71,8 @@ class NetworkDescription(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
             raise ValueError('classes is empty; name at least one, as in classes = { 0 = "person" }')
         if self.batch * self.input[0] * self.input[1] > MAX_INPUT_PIXELS:
             raise ValueError(f"batch is too large for this input; take at most {MAX_INPUT_PIXELS / 1e6:g} megapixels")
+        if self.mask_coefficients and self.layout in ("detr", "separate"):
+            raise ValueError(f'mask_coefficients has no effect on layout = "{self.layout}"; remove it')
         if self.resize == "stretch" and self.fill != 114:
             raise ValueError('fill has no effect on resize = "stretch"; remove it')
 
@@ -81,6 +85,12 @@ class NetworkDescription(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
     def in_pixels(self) -> bool:
         """``pixels``, or what is usual of the layout."""
         return self.layout != "detr" if self.pixels is None else self.pixels
+
+    @property
+    def greatest_overlap(self) -> float:
+        """``nms``, or what is usual of the layout."""
+        usual = 1.0 if self.layout in ("end2end", "detr", "separate") else 0.6
+        return usual if self.nms is None else self.nms
 
     @property
     def score_activation(self) -> Activation:

@@ -12,10 +12,11 @@ import numpy.typing as npt
 
 from edge.detectors.base import Detection, DetectorOptions, Prediction
 from edge.detectors.network.boxes import BoxLabeller, NetworkBox, seen_keypoints
-from edge.detectors.network.decode import Boxes, decode
+from edge.detectors.network.decode import Boxes, check_grey, decode
 from edge.detectors.network.description import NetworkDescription, read_description
 from edge.detectors.network.runtime import Runtime, open_runtime
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import InputError
 from protocols.geometry.types import Image
 
 
@@ -43,6 +44,7 @@ class NetworkDetector:
         self._labeller = BoxLabeller(options.prefix, description.box_std)
         self._time = -1.0 / options.fps
         self.batch = runtime.batch or description.batch
+        self._singly = self._checked = False
         width, height = description.input
         self._infer([np.full((height, width, 3), description.fill, dtype=np.uint8)])
 
@@ -66,8 +68,19 @@ class NetworkDetector:
         return match_predictions(found, predictions)
 
     def detect_batch(self, images: Sequence[Image], times_s: Sequence[float]) -> list[list[Detection]]:
-        """See ``BatchDetector``."""
-        found = self._infer(images)
+        """See ``BatchDetector``.
+
+        A model that takes one image at a time, though its file says any number, is given one at a time.
+        """
+        if not self._singly:
+            try:
+                found = self._infer(images)
+            except InputError:
+                if len(images) == 1:
+                    raise
+                self._singly = True
+        if self._singly:
+            found = [one for image in images for one in self._infer([image])]
         return [self._detections(*one) for one in zip(images, found, times_s, strict=True)]
 
     def _infer(self, images: Sequence[Image]) -> list[tuple[Boxes, Resize]]:
@@ -80,7 +93,12 @@ class NetworkDetector:
             inputs = [one for one, _ in part]
             inputs += [inputs[-1]] * (self._runtime.batch - len(inputs))
             outputs = self._runtime.run(np.stack(inputs))
-            boxes = decode(outputs, self._description, len(inputs), self._options.kind, self._file)
+            if not self._checked:
+                check_grey(outputs, self._description, len(inputs), self._file)
+                self._checked = True
+            boxes = decode(
+                outputs, self._description, len(inputs), self._options.kind, self._file, self._runtime.classes
+            )
             found += [(one, resize) for one, (_, resize) in zip(boxes, part, strict=False)]
         return found
 

@@ -7,6 +7,7 @@ runtime reads whatever file a tensor's external data names, and runs loops of an
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
@@ -26,6 +27,8 @@ Array = npt.NDArray[Any]
 MAX_OUTPUT = 50_000_000
 """Numbers in all outputs of one run: four times what YOLOv5 gives for 32 images of 640x640 in 9 classes (1.1e7)."""
 _INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+_SIZE_INPUT = "orig_target_sizes"
+"""Of the exports of RT-DETR, D-FINE and DEIM: (n, 2) width and height in which boxes are wanted [px]."""
 _MAX_MEMORY = 4 << 30
 """[bytes] of all models of a process in onnxruntime: four times the largest model file that is accepted."""
 
@@ -34,10 +37,17 @@ MAX_BYTES = 1 << 30
 _MAX_DEPTH = 8
 """Of graphs within graphs."""
 _LOOPS = frozenset({"Loop", "Scan"})
+_CLASS_NAME = re.compile(r"[{,] *\d+: *['\"]")
+"""In Ultralytics' metadata ``names``: a dictionary {0: 'person', …} as Python prints it."""
 _REMEDY = "export the model again"
 # The part of onnx.proto3 (onnx.ai, IR version 10) that is looked at: message → field → (number, type, repeated).
 _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
-    "Model": {"ir_version": (1, "int64", False), "graph": (7, "Graph", False), "functions": (25, "Function", True)},
+    "Model": {
+        "ir_version": (1, "int64", False),
+        "graph": (7, "Graph", False),
+        "metadata_props": (14, "Entry", True),
+        "functions": (25, "Function", True),
+    },
     "Function": {"node": (7, "Node", True)},
     "Graph": {
         "node": (1, "Node", True),
@@ -75,9 +85,10 @@ _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
 
 
 class Runtime(Protocol):
-    """A loaded model. batch: the fixed number of images that it takes, 0 = any number."""
+    """A loaded model. batch: the fixed number of images that it takes, 0 = any number. classes: named in it, or 0."""
 
     batch: int
+    classes: int
 
     def run(self, images: npt.NDArray[np.float32]) -> dict[str, Array]:
         """The outputs by name of images (n, 3, H, W), normalised; n is ``batch`` where that is not 0."""
@@ -87,20 +98,23 @@ def open_runtime(
     file: Path, backend: Literal["auto", "onnxruntime", "opencv"], size: tuple[int, int], threads: int
 ) -> Runtime:
     """Load a model that takes images of ``size`` (width, height). threads: at most as many as cores. InputError."""
-    batch = _fixed_batch(check_model_file(file), size, file)
+    inputs, classes = check_model_file(file)
+    batch = _fixed_batch(inputs, size, file)
     installed = find_spec("onnxruntime") is not None
     if backend == "onnxruntime" and not installed:
         remedy = 'pip install onnxruntime, or set backend = "opencv"'
         raise InputError("onnxruntime is not installed", file=file, remedy=remedy)
     if installed and backend != "opencv":
-        return OnnxRuntime(file, batch, min(threads, os.cpu_count() or 1))
-    return OpenCvRuntime(file, batch)
+        return OnnxRuntime(file, batch, classes, size, min(threads, os.cpu_count() or 1))
+    if _SIZE_INPUT in inputs:
+        raise InputError(f"OpenCV does not run models with {_SIZE_INPUT}", file=file, remedy="pip install onnxruntime")
+    return OpenCvRuntime(file, batch, classes)
 
 
 class OnnxRuntime:
-    """onnxruntime on the processor. Raises InputError where the model is not usable."""
+    """onnxruntime on the processor. size: (width, height) of the input. Raises InputError if it is not usable."""
 
-    def __init__(self, file: Path, batch: int, threads: int) -> None:
+    def __init__(self, file: Path, batch: int, classes: int, size: tuple[int, int], threads: int) -> None:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
@@ -119,8 +133,10 @@ class OnnxRuntime:
             self._session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # noqa: BLE001 - onnxruntime's errors have no other common class
             raise _unusable(file, error) from None
-        (images,) = self._session.get_inputs()
-        self._input, self.batch = images.name, batch
+        inputs = {one.name: one for one in self._session.get_inputs()}
+        self._size = np.array([size], dtype=np.int64) if inputs.pop(_SIZE_INPUT, None) else None
+        (images,) = inputs.values()
+        self._input, self.batch, self.classes = images.name, batch, classes
         if images.type not in _INPUT_TYPES:
             what = f"the model's input is a {images.type}"
             raise InputError(what, file=file, remedy="export it with an input of 32 or 16 bit floating point")
@@ -128,8 +144,11 @@ class OnnxRuntime:
         self._outputs = [one.name for one in self._session.get_outputs()]
 
     def run(self, images: npt.NDArray[np.float32]) -> dict[str, Array]:
+        given: dict[str, Array] = {self._input: images.astype(self._type, copy=False)}
+        if self._size is not None:
+            given[_SIZE_INPUT] = self._size.repeat(len(images), axis=0)
         try:
-            found = self._session.run(self._outputs, {self._input: images.astype(self._type, copy=False)})
+            found = self._session.run(self._outputs, given)
         except Exception as error:  # noqa: BLE001 - as above
             raise _unusable(self._file, error) from None
         return _checked(dict(zip(self._outputs, found, strict=True)), self._file)
@@ -138,8 +157,8 @@ class OnnxRuntime:
 class OpenCvRuntime:
     """OpenCV's dnn module, one image at a time if the model allows. Raises InputError where it is not usable."""
 
-    def __init__(self, file: Path, batch: int) -> None:
-        self._file, self.batch = file, batch or 1
+    def __init__(self, file: Path, batch: int, classes: int) -> None:
+        self._file, self.batch, self.classes = file, batch or 1, classes
         try:
             self._net = cv2.dnn.readNetFromONNX(str(file))
             self._outputs = list(self._net.getUnconnectedOutLayersNames())
@@ -157,10 +176,11 @@ class OpenCvRuntime:
 
 def _fixed_batch(inputs: dict[str, list[int | str]], size: tuple[int, int], file: Path) -> int:
     """The number of images that a model takes at once, 0 = any. inputs: shapes by name. InputError if not images."""
-    if len(inputs) != 1:
+    shapes = [shape for name, shape in inputs.items() if name != _SIZE_INPUT]
+    if len(shapes) != 1:
         names = ", ".join(inputs)[:120]
         raise InputError(f"the model has {len(inputs)} inputs ({names})", file=file, remedy="export it with one")
-    (shape,) = inputs.values()
+    (shape,) = shapes
     fixed = [one if isinstance(one, int) and one > 0 else 0 for one in shape]
     written = "x".join(str(one or "?") for one in shape)[:80]
     if len(fixed) != 4 or fixed[1] not in (0, 3) or fixed[3] == 3:  # 3 last: height x width x channels
@@ -194,10 +214,10 @@ def _unusable(file: Path, error: Exception) -> InputError:
     return InputError(f"the model cannot be run: {text}", file=file, remedy="export it again, and check `input`")
 
 
-def check_model_file(file: Path) -> dict[str, list[int | str]]:
-    """The shapes of a model's inputs. A size that is not fixed is a name, or 0.
+def check_model_file(file: Path) -> tuple[dict[str, list[int | str]], int]:
+    """The shapes of a model's inputs, and how many classes it names, 0 = none.
 
-    Raises InputError unless the file can be given to a runtime.
+    A size that is not fixed is a name, or 0. Raises InputError unless the file can be given to a runtime.
     """
     try:
         size = file.stat().st_size
@@ -226,11 +246,13 @@ def check_model_file(file: Path) -> dict[str, list[int | str]]:
             if size > MAX_BYTES:
                 raise InputError(f"the model's data exceeds {MAX_BYTES >> 20} MiB", file=file, remedy=_REMEDY)
     constants = {one.name for one in model.graph.initializer}  # until IR version 3, these are listed as inputs too
-    return {
+    inputs = {
         one.name: [size.dim_param or size.dim_value for size in one.type.tensor_type.shape.dim]
         for one in model.graph.input
         if one.name not in constants
     }
+    names = next((one.value for one in model.metadata_props if one.key == "names"), "")
+    return inputs, len(_CLASS_NAME.findall(names))
 
 
 def _check_inputs(graph: Any, outer: frozenset[str], file: Path) -> None:

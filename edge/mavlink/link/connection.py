@@ -170,7 +170,7 @@ class Link:
                 self._signing.save()
 
     def report(self, now_ns: int) -> str:
-        """Who else claims to be the vehicle, or why the signing times are not stored; "" if there is nothing."""
+        """Who else is or claims to be the vehicle, or why the signing times are not stored; "" if there is nothing."""
         since, text = self._conflict
         if now_ns - since < _CONFLICT_SHOWN_NS:
             return text
@@ -280,7 +280,10 @@ class Link:
         silent_ns = now - self.last_received_ns
         returned = self._is_first(key, candidate, now)
         if silent_ns <= _SILENT_NS and not returned:
-            return  # another vehicle behind the same router
+            if beats and not self._fixed:  # another vehicle behind the same router
+                text = f"system {system} is on this link too, and is not followed (vehicle in [mavlink] chooses)"
+                self._conflict = (now, text)
+            return
         if returned:
             objection = ""
         elif self._fixed and system != self.vehicle:

@@ -61,6 +61,12 @@ class StatusTexts:
             return None
         return f"Syncline: station {station} took over from {previous}", mavlink.MAV_SEVERITY_NOTICE
 
+    def stop(self, station: int) -> StatusText | None:
+        """A station stops tracking. The text if another one had selected the target."""
+        if self._operator in (None, station) or self._announced == "idle":
+            return None
+        return f"Syncline: station {station} stops what {self._operator} tracks", mavlink.MAV_SEVERITY_NOTICE
+
     def update(self, state: str, now_s: float) -> StatusText | None:
         """The text that is due. state: as in ``TrackingStatus``."""
         if state != self._state:
@@ -254,7 +260,7 @@ class CameraComponent:
             return accepted if by_station and self._on_command(ArmFollow(p[0] > 0, received.system)) else denied
         elif command == mavlink.MAV_CMD_CAMERA_STOP_TRACKING:
             self.counters["stops"] += 1
-            return accepted if self._on_command(StopTracking(received.system)) else mavlink.MAV_RESULT_FAILED
+            return accepted if self._stop(received.system) else mavlink.MAV_RESULT_FAILED
         else:
             return None
         inside = all(
@@ -271,6 +277,11 @@ class CameraComponent:
         self._rates.select((received.system, received.component))
         self._send_text(self._texts.select(received.system))
         return accepted
+
+    def _stop(self, station: int) -> bool:
+        stopped = self._on_command(StopTracking(station))
+        self._send_text(self._texts.stop(station) if stopped else None)
+        return stopped
 
     def _send_response(self, command: int, p: tuple[float, ...], result: int) -> None:
         """Send the data that a command requested, after its ACK."""

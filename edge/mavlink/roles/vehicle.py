@@ -83,6 +83,11 @@ class Vehicle:
         """Where positions count from; None while that is unknown."""
         return self.frame.origin
 
+    @property
+    def ignores_unsigned(self) -> bool:
+        """Whether it signs what cannot be verified without a key, and answers nothing; it takes a moment to answer."""
+        return self._link.counters["signed"] > 0 and not self.clock.answered
+
     def motion_at(self, time_s: float) -> tuple[Floats, Floats] | None:
         """Position from ``origin`` and velocity (3,) NED [m, m/s] at a host time; None if not known of late."""
         return self.frame.at(time_s)
@@ -101,6 +106,8 @@ class Vehicle:
         if self._first_s is not None and now - max(self._sample_s, self._first_s) > _MISSING_AFTER_S:
             source = "gimbal (GIMBAL_DEVICE_ATTITUDE_STATUS)" if self._gimbal else "autopilot (ATTITUDE_QUATERNION)"
             return f"no attitude of the {source}" + (f": {refused}" if refused else "")
+        if self._first_s is not None and now - self._first_s > _MISSING_AFTER_S and self.ignores_unsigned:
+            return "the vehicle signs its messages and ignores unsigned ones: set key in [mavlink]"
         slow = f"attitudes come at {1.0 / self._spacing_s:.1f} Hz, too seldom for positions: ask for 4 Hz or more"
         return refused or (slow if self._spacing_s > _MAX_SPACING_S else "")
 

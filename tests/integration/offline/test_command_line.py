@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
+from edge.uav.world.scenarios import SCENARIOS
 
 
 @pytest.fixture(scope="module")
@@ -170,3 +171,8 @@ def test_every_help_shows_an_example(command: str) -> None:
         [sys.executable, "-m", "deploy", command, "--help"], capture_output=True, text=True, check=True
     ).stdout
     assert f"syncline {command} " in shown.split("Example:")[1]
+
+
+def test_the_help_of_simulate_names_every_scenario(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["simulate", "--help"]) == 0
+    assert set(SCENARIOS) <= {word.strip(",.") for word in capsys.readouterr().out.split()}

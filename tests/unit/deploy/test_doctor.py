@@ -362,13 +362,20 @@ FLYING = {"samples": ATTITUDES, "synchronised": True}
         ({**FLYING, "samples": ATTITUDES[::5]}, "warn", "a faster port"),
         ({}, "fail", "SERIALx_PROTOCOL = 2"),
         ({"gimbal": True}, "fail", "MNT1_TYPE"),
-        ({"samples": ATTITUDES, "signs": True}, "fail", "set key"),
+        ({"samples": ATTITUDES, "ignores_unsigned": True}, "fail", "set key"),
     ],
 )
 def test_vehicle_telemetry(heard: dict[str, Any], verdict: str, remedy: str) -> None:
-    options = {name: heard[name] for name in ("gimbal", "signs") if name in heard}
-    found = autopilot.Heard(**{name: value for name, value in heard.items() if name not in options})
-    check(autopilot.telemetry(found, **{"gimbal": False, "rate_hz": 50.0, **options}), verdict, remedy)
+    found = autopilot.Heard(**{name: value for name, value in heard.items() if name != "gimbal"})
+    check(autopilot.telemetry(found, gimbal=heard.get("gimbal", False), rate_hz=50.0), verdict, remedy)
+
+
+def test_another_vehicle_and_a_gimbal_that_is_not_used_are_named() -> None:
+    heard = autopilot.Heard(conflict="system 2 is on this link too", gimbal=True)
+    vehicle, gimbal = autopilot.unused(heard, 1, gimbal=False)
+    check(vehicle, "warn", "set vehicle")
+    check(gimbal, "warn", 'mount = "gimbal"')
+    assert list(autopilot.unused(autopilot.Heard(gimbal=True), 1, gimbal=True)) == []
 
 
 @pytest.mark.parametrize(

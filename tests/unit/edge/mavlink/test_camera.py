@@ -407,6 +407,13 @@ def test_status_texts_say_what_happens_to_the_target() -> None:
     fly("lost", 1)
     fly("idle", 1)
     assert texts == ["Syncline: target lost, select it again", "Syncline: tracking stopped"]
+    texts.clear()
+    tracked(under_test, QGC)
+    fly("visible", 1)
+    stop = mavlink.MAV_CMD_CAMERA_STOP_TRACKING
+    for station, said in ((OTHER, ["Syncline: station 253 stops what 255 tracks"]), (QGC, [])):
+        answers = under_test.command(stop, by=station)
+        assert [m.text for m in answers if m.get_type() == "STATUSTEXT"] == said
     assert all(len(text) <= 50 for text, _ in camera_role._TEXTS.values())
 
 

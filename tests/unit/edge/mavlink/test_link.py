@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import random
+import time
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,12 @@ def test_messages_are_accepted_only_after_an_autopilots_heartbeat_and_from_that_
     other.send(heartbeat())
     assert link.poll() == []
     assert (link.vehicle, link.counters["refused.other_vehicle"]) == (1, 1)
+    assert link.report(time.monotonic_ns()).startswith("system 2 is on this link too, and is not followed")
+    chosen, pipe = make_link(vehicle=1)
+    for system in (1, 2):
+        Sender(pipe, system).send(heartbeat())
+    chosen.poll()
+    assert (chosen.vehicle, chosen.report(time.monotonic_ns())) == (1, "")
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])

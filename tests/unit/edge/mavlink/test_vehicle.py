@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections import Counter
 from functools import partial
 from typing import Any
 
@@ -31,6 +32,7 @@ class NoLink:
 
     def __init__(self) -> None:
         self.sent: list[Any] = []
+        self.counters: Counter[str] = Counter()
 
     def send(self, message: Any) -> bool:
         self.sent.append(message)
@@ -270,6 +272,19 @@ def test_a_gimbal_that_never_reports_is_named() -> None:
     for k in range(40):
         under_test.attitude(0.1 * k)
     assert under_test.vehicle.problem(4_000_000_000) == "no attitude of the gimbal (GIMBAL_DEVICE_ATTITUDE_STATUS)"
+
+
+def test_an_autopilot_that_signs_and_answers_nothing_is_named() -> None:
+    under_test = VehicleUnderTest()
+    for k in range(40):
+        under_test.attitude(0.1 * k)
+    assert under_test.vehicle.problem(4_000_000_000) == ""
+    under_test.link.counters["signed"] += 1
+    assert under_test.vehicle.problem(2_000_000_000) == ""  # not asked long enough
+    assert under_test.vehicle.problem(4_000_000_000).endswith("ignores unsigned ones: set key in [mavlink]")
+    boot_ns = round(1e9 * (4.0 + BOOT_S))
+    under_test.take(mavlink.MAVLink_timesync_message(boot_ns, round(4e9 - 1e9 * DELAY_S)), 4.0)
+    assert under_test.vehicle.problem(4_100_000_000) == ""
 
 
 def test_samples_are_later_than_each_other_and_never_later_than_their_arrival() -> None:

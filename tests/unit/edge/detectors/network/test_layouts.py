@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from onnx import helper, numpy_helper
 
-from edge.detectors.base import Detection
+from edge.detectors.base import BatchDetector, Detection
 from edge.detectors.network.decode import decode
 from edge.detectors.network.description import NetworkDescription
 from edge.detectors.plugins import load_detector
@@ -45,6 +46,16 @@ def lone(box: Array, score: float, label: float, *more: float) -> list[float]:
     return [*corners(box), score, label, *more]
 
 
+def cell_relative(rows: Array) -> Array:
+    """Candidates as YOLOX gives them: (x - column · s) / s and log(w / s) of its cell; one cell each, none else."""
+    cells = [(x, y, s) for s in (8, 16, 32) for y in range(48 // s) for x in range(64 // s)]
+    out = np.zeros((len(cells), rows.shape[1]), dtype=np.float32)
+    for k, row in zip((3, 49, 11, 60), rows[:4], strict=True):
+        x, y, s = cells[k]
+        out[k] = [row[0] / s - x, row[1] / s - y, *np.log(row[2:4] / s), *row[4:]]
+    return out
+
+
 LOGITS = np.array([[6.0, 0.0, 0.0, 0.0], [0.0, 0.0, 5.0, 0.0], [0.0, 0.0, 0.0, 9.0]])
 SIZE4 = np.array([64.0, 48.0, 64.0, 48.0])
 OUTPUTS = {
@@ -52,14 +63,20 @@ OUTPUTS = {
     'layout = "yolov8" # turned': {"output0": table(False)[None]},
     'layout = "yolov5"': {"output0": table(True)[None]},
     'layout = "yolov5" # turned': {"output0": table(True).T[None]},
+    'layout = "yolox"': {"output0": cell_relative(table(True))[None]},
+    'layout = "yolov8"\nmask_coefficients = 2': {"output0": np.hstack([table(False), np.full((94, 2), 7.0)]).T[None]},
     'layout = "end2end"': {"output0": [[lone(PERSON, 0.9, 0), lone(TRUCK, 0.6, 2), lone(PERSON, 0.8, 1)]]},
     'layout = "detr"': {
-        "logits": LOGITS[None],
-        "pred_boxes": np.array([PERSON, TRUCK, PERSON])[None] / SIZE4,
+        "logits": np.vstack([LOGITS, LOGITS[2:]])[None],
+        "pred_boxes": np.array([PERSON, TRUCK, PERSON, PERSON])[None] / SIZE4,
     },
     'layout = "detr"\nactivation = "sigmoid"\noutputs = { scores = "a", boxes = "b" }': {
         "a": np.array([[[2.197, -9.0, -9.0], [-9.0, -9.0, 0.405], [-9.0, 3.0, -9.0]]]),
         "b": np.array([PERSON, TRUCK, PERSON])[None] / SIZE4,
+    },
+    'layout = "detr"\nactivation = "none"\nnms = 0.6': {
+        "logits": table(False)[None, :, 4:],
+        "pred_boxes": table(False)[None, :, :4] / SIZE4,
     },
     'layout = "separate"': {
         "boxes": np.array([corners(PERSON), corners(TRUCK), corners(PERSON)])[None],
@@ -94,7 +111,7 @@ def test_a_person_and_a_truck_are_found_where_they_are(tmp_path: Path, toml: str
     assert person.covariance == pytest.approx((25.0, 0.0, 225.0), rel=1e-3)
     assert truck.box == pytest.approx((400.0, 40.0, 200.0, 120.0), abs=0.05)
     assert (truck.u, truck.v, truck.head, truck.foot) == (pytest.approx(499.5), pytest.approx(99.5), None, None)
-    if "detr" not in toml:
+    if "detr" not in toml or "nms" in toml:
         assert (person.score, truck.score) == pytest.approx((0.9, 0.6), abs=1e-3)
     assert [one.label for one in found] == ["p0", "t0"]
 
@@ -105,7 +122,7 @@ WITH_KEYPOINTS = {
         "o": np.array([[*PERSON, 0.9, *KEYPOINTS]] + [[*PERSON, 0.0, *KEYPOINTS]] * 20).T[None]
     },
     'layout = "end2end"': {"o": [[lone(PERSON, 0.9, 0, *KEYPOINTS)]]},
-    'layout = "detr"': {
+    'layout = "detr"\nactivation = "softmax"': {
         "logits": LOGITS[None, :1],
         "pred_boxes": PERSON[None, None] / SIZE4,
         "keypoints": (np.array(KEYPOINTS).reshape(1, 1, 3, 3) / [64.0, 48.0, 1.0]),
@@ -158,13 +175,43 @@ def test_torchvision_leaves_out_the_axis_of_the_batch() -> None:
         assert found.keypoints.shape == (count, 1, 3)
 
 
+def test_detections_of_a_batch_may_be_listed_with_the_index_of_their_image() -> None:
+    description = NetworkDescription(model="", layout="end2end", classes={"2": "vehicle"}, input=(64, 48))
+    rows = np.array([[1, *corners(TRUCK), 2, 0.6], [0, *corners(TRUCK), 0, 0.9], [1, *corners(PERSON), 2, 0.5]])
+    first, second, third = decode({"o": rows}, description, 3, None, Path("m.onnx"))
+    assert (len(first), len(third)) == (0, 0)
+    assert second.score.tolist() == [0.6, 0.5]
+    assert second.corner[0].tolist() == corners(TRUCK).tolist()
+    assert [len(one) for one in decode({"o": rows[:0]}, description, 2, None, Path("m.onnx"))] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("toml", "outputs", "names", "message"),
+    [
+        ('layout = "yolov8"', {"o": table(True)[None]}, 3, "gives 8 values a candidate; .* 3 classes .* has 7;"),
+        ('layout = "yolov5"', {"o": table(False)[None]}, 3, "gives 7 values a candidate; .* 3 classes .* has 8;"),
+        ('layout = "end2end"', {"o": [[lone(PERSON, 0.9, 0)]]}, 2, "class 2 is beyond the 2 classes that"),
+        ('layout = "yolov8"', {"o": table(False)[None]}, 3, ""),
+    ],
+)  # fmt: skip
+def test_classes_that_the_model_names_have_to_fit_the_layout(
+    tmp_path: Path, toml: str, outputs: dict[str, Array], names: int, message: str
+) -> None:
+    model = constant_model(outputs)
+    model.metadata_props.add(key="names", value=str({k: f"it's {k}, or so" for k in range(names)}))
+    file = write_network(tmp_path, model, toml, CLASSES)
+    if message:
+        with pytest.raises(InputError, match=message):
+            load_detector(file)
+    else:
+        assert len(load_detector(file).detect(IMAGE)) == 2
+
+
 @pytest.mark.parametrize(
     ("batch", "size", "backend"),
     [("n", 4, "auto"), (3, 3, "auto"), (1, 1, "auto"), (3, 3, "opencv"), ("n", 1, "opencv")],
 )
 def test_a_batch_gives_what_single_images_give(tmp_path: Path, batch: int | str, size: int, backend: str) -> None:
-    from edge.detectors.base import BatchDetector
-
     file = write_network(
         tmp_path, constant_model(OUTPUTS['layout = "yolov8"'], batch), f'backend = "{backend}"', CLASSES
     )
@@ -175,6 +222,18 @@ def test_a_batch_gives_what_single_images_give(tmp_path: Path, batch: int | str,
     together = detector.detect_batch([IMAGE] * 5, times)
     alone = load_detector(file)
     assert together == [alone.detect(IMAGE, time) for time in times]
+
+
+def test_a_model_that_takes_one_image_though_it_declares_any_number_gets_one(tmp_path: Path) -> None:
+    """It was refused after the first image, with advice about its input."""
+    model = constant_model(OUTPUTS['layout = "yolov8"'])
+    shape = numpy_helper.from_array(np.array([1, 3, 48, 64]), "one")
+    model.graph.initializer.append(shape)
+    model.graph.node[0].input[0] = "image"
+    model.graph.node.insert(0, helper.make_node("Reshape", ["images", "one"], ["image"]))
+    detector = load_detector(write_network(tmp_path, model, "", CLASSES))
+    assert isinstance(detector, BatchDetector)
+    assert [len(found) for found in detector.detect_batch([IMAGE] * 3, [0.0, 0.1, 0.2])] == [2, 2, 2]
 
 
 @pytest.mark.parametrize(
@@ -206,7 +265,10 @@ def test_what_the_image_border_cuts_is_not_measured(
         ('layout = "yolov8"', {"o": np.full((1, 7, 50), 8.0)}, "scores reach 8 to 8"),
         (f'layout = "yolov8"\n{POINTS}', {"o": np.zeros((1, 12, 50))}, "with 3 keypoints"),
         ('layout = "end2end"', {"o": np.zeros((1, 50, 7))}, "do not fit"),
+        ('layout = "yolox"', {"o": np.zeros((1, 50, 8))}, "do not fit"),
         ('layout = "detr"', {"o": np.zeros((1, 50, 4))}, "no output 'logits' for scores; its outputs are o 1x50x4"),
+        ('layout = "detr"', {"logits": np.full((1, 50, 80), -5.0), "pred_boxes": np.ones((1, 50, 4))},
+         'of an empty image 0 % of the candidates are "no object".*set activation = "sigmoid"'),
         ('layout = "separate"', {"boxes": np.zeros((1, 5, 4)), "scores": np.zeros((1, 6)), "labels": np.zeros((1, 5))},
          "do not fit"),
         ('outputs = { boxes = "o" }', {"o": np.zeros((1, 7, 50))}, "outputs.boxes has no meaning"),

@@ -63,6 +63,25 @@ def two_inputs() -> onnx.ModelProto:
     return model
 
 
+def of_wanted_size() -> onnx.ModelProto:
+    """A model that gives one box as large as its second input says, as RT-DETR's own export does."""
+    images = helper.make_tensor_value_info("images", TensorProto.FLOAT, ["n", 3, 48, 64])
+    size = helper.make_tensor_value_info("orig_target_sizes", TensorProto.INT64, ["n", 2])
+    names = {"boxes": ["n", 1, 4], "scores": ["n", 1], "labels": ["n", 1]}
+    stored = [numpy_helper.from_array(np.array(part), name) for name, part in (("1", [1]), ("n4", [-1, 1, 4]))]
+    nodes = [
+        helper.make_node("Cast", ["orig_target_sizes"], ["size"], to=TensorProto.FLOAT),
+        helper.make_node("Sub", ["size", "size"], ["corner"]),
+        helper.make_node("Concat", ["corner", "size"], ["flat"], axis=1),
+        helper.make_node("Reshape", ["flat", "n4"], ["boxes"]),
+        helper.make_node("ReduceMin", ["corner"], ["labels"], axes=[1]),
+        helper.make_node("Cos", ["labels"], ["scores"]),
+        helper.make_node("ReduceMean", ["images"], ["unused"]),
+    ]
+    outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in names.items()]
+    return model_of(nodes, [images, size], outputs, stored)
+
+
 def of_input(shape: list[Any], kind: int = TensorProto.FLOAT) -> onnx.ModelProto:
     images = helper.make_tensor_value_info("images", kind, shape)
     out = helper.make_tensor_value_info("o", kind, None)
@@ -139,6 +158,15 @@ def test_opencv_refuses_them_too(tmp_path: Path, model: onnx.ModelProto | bytes,
         load_detector(write_network(tmp_path, model, 'backend = "opencv"'))
 
 
+def test_a_model_that_asks_for_the_size_of_its_boxes_gets_that_of_its_input(tmp_path: Path) -> None:
+    toml = 'layout = "separate"\nresize = "stretch"'
+    detector = load_detector(write_network(tmp_path, of_wanted_size(), toml))
+    (person,) = detector.detect(np.zeros((480, 640, 3), np.uint8))
+    assert person.box == pytest.approx((0.0, 0.0, 640.0, 480.0))
+    with pytest.raises(InputError, match="OpenCV does not run models with orig_target_sizes"):
+        load_detector(write_network(tmp_path, of_wanted_size(), f'{toml}\nbackend = "opencv"'))
+
+
 def test_outputs_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime, "MAX_OUTPUT", 999)
     with pytest.raises(InputError, match="outputs have more than 999 numbers"):
@@ -171,6 +199,7 @@ def test_external_data_beside_the_model_is_read_and_counted(tmp_path: Path, monk
         ("score = ", "not valid TOML"),
         ("mean = [nan, 0.0, 0.0]", "mean"),
         ('fill = 0\nresize = "stretch"', "fill has no effect"),
+        ('mask_coefficients = 32\nlayout = "detr"', "mask_coefficients has no effect"),
         ("#" * 5_000_000, "has more than 4194304 bytes"),
     ],
 )
