@@ -19,7 +19,6 @@ from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.ground.photometric import contrast_table
 from edge.uav.ground_tracker import GroundTracker
 from edge.uav.image_motion.repeated_images import is_repeated
-from edge.uav.image_motion.scene_cut import SceneCut
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Image
@@ -35,7 +34,6 @@ _CALM = 0.5  # step in the image, in target lengths, above which the appearance 
 _COMPLETE = 0.9  # share of a box in the image from which the appearance can learn it
 _RETRY_S = 4.0  # after which the ground is tried again; doubles each time
 _REPEATED_S = 1.0  # of one image, after which its target is not seen any more, as a camera's is then reported as frozen
-_CUT = "the video shows another scene since a cut"
 _ATTITUDE = "the attitude says that the camera looks down"
 
 
@@ -69,7 +67,6 @@ class AdaptiveTracker:
         self._contrast = contrast_table(image)
         image = self._stretched(image)
         self._viewed, self._viewed_at = image, time
-        self._scene_cut = SceneCut(image)
         first = self._ground.begin(image, time, target)
         seen = self._appearance.begin(image, time, target)
         self._steep = self._looks_down(self._ground)
@@ -86,8 +83,7 @@ class AdaptiveTracker:
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
         """Track the target into the next frame; ``None`` for a frame that could not be decoded.
 
-        An image that repeats one with the target has that one's estimate: it says nothing of the time since. In another
-        scene after a cut the target is lost, until the scene of before is back. With telemetry there are no cuts.
+        An image that repeats one with the target has that one's estimate: it says nothing of the time since.
         """
         image = None if image is None else self._stretched(image)
         if image is not None and self._last.state is TrackState.VISIBLE and is_repeated(self._viewed, image):
@@ -95,13 +91,6 @@ class AdaptiveTracker:
             return replace(self._last, time=time, state=TrackState.VISIBLE if recent else TrackState.COASTING)
         if image is not None:
             self._viewed, self._viewed_at = image, time
-            if not self._samples and self._scene_cut.update(image):
-                lost = replace(
-                    self._follow(None, time), state=TrackState.LOST, hypotheses=(), particles=None, layers={}
-                )
-                nan = float("nan")
-                self._last = replace(lost, x=nan, y=nan, heading=nan, basis=Basis.IMAGE, reason=_CUT)
-                return self._last
         self._last = self._follow(image, time)
         return self._last
 

@@ -22,7 +22,6 @@ from edge.uav.correlation.velocity import VelocityFilter
 from edge.uav.image_motion.first_motion import FirstMotion
 from edge.uav.image_motion.median_background import MedianBackground
 from edge.uav.image_motion.residual import UNKNOWN, MovingParts, Residual
-from edge.uav.image_motion.scene_cut import SceneCut
 from edge.uav.image_motion.scene_motion import Motion, SceneMotion
 from protocols.geometry.types import Image
 
@@ -457,30 +456,3 @@ def test_images_repeated_while_a_link_stalls_do_not_stop_the_target(scene: Image
         late = k in stalled and k > 29 + FPS + 1e-6
         assert found.state is (TrackState.COASTING if late else TrackState.VISIBLE), k
         assert np.hypot(found.x - place[0], found.y - place[1]) < 6.0, k
-
-
-def test_after_a_cut_the_target_is_lost_until_its_scene_is_back(scene: Image) -> None:
-    """It went on through the other scene, with a std of a few px."""
-    scene = cv2.convertScaleAbs(scene, alpha=2.0, beta=-120.0)
-    tracker = AdaptiveTracker(SIZE, fps=FPS)
-    start, step = np.array([60.0, 120.0]), np.array([2.0, 0.0])
-    tracker.begin(painted(scene, start), 0.0, Box(*(start - 0.5 * TARGET), *map(float, TARGET)))
-    other = np.ascontiguousarray(scene[240 : 240 + SIZE[1], 550 : 550 + SIZE[0]])
-    black = np.zeros_like(other)
-    shown: list[Image | None] = [painted(scene, start + k * step) for k in range(1, 50)]
-    shown[10:30] = [np.roll(other, k, axis=1) for k in range(20)]
-    shown[35:38] = [black, None, black]
-    states = [tracker.handle_frame(image, k / FPS).state for k, image in enumerate(shown, 1)]
-    assert states[:10] == [TrackState.VISIBLE] * 10
-    assert states[11:30] == [TrackState.LOST] * 19
-    assert TrackState.LOST not in states[36:]
-    assert states[-5:] == [TrackState.VISIBLE] * 5
-
-
-def test_images_that_have_no_features_in_common_with_each_other_are_no_cut(scene: Image) -> None:
-    """As of a camera that turns fast in the dark: noise hides what they have in common with the images of before."""
-    rng = np.random.default_rng(2)
-    first = painted(scene, np.array([60.0, 120.0]))
-    cuts = SceneCut(first)
-    noise = [np.asarray(rng.integers(0, 255, first.shape), np.uint8) for _ in range(12)]
-    assert not any(cuts.update(image) for image in [*noise, first, first])
