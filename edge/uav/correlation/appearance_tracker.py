@@ -169,9 +169,7 @@ class AppearanceTracker:
             origin, sure = motion.at(box.centre, self._scene.reach), sure.at(motion.at(sure.centre, self._scene.reach))
             for moving in (self._motion_filter, velocity):
                 moving.follow_scene(motion.matrix[:, :2])
-            if self._missed == 0:
-                box = motion.moved(box)
-            sure = motion.moved(sure)
+            box, sure = motion.moved(box), motion.moved(sure)
             self._redetection.move(motion, self._scene.reach, dt)
         elif expected is None and (self._missed or self._time - self._trusted_at < _FAST_PAN_S):
             for moving in (self._motion_filter, velocity):
@@ -285,7 +283,7 @@ class AppearanceTracker:
         # Where it looks less like the target than what is beside it, it says little about how the target moves.
         unsure = 1.0 - inside if self._ratio > 0.0 else 1.0
         self._motion_filter.correct(box.centre - self.box.centre, self.length, unsure)
-        wider, higher, turn = self._flow.change(image, box.centre, stood) if inside > _SIZE_INSIDE else (1.0, 1.0, 0.0)
+        wider, higher, turn = self._flow.change(image, box, stood) if inside > _SIZE_INSIDE else (1.0, 1.0, 0.0)
         box = box.sized(box.sides * [wider, higher]).turned(turn)
         if inside > _LEARN_INSIDE:
             self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)

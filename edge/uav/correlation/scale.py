@@ -47,16 +47,18 @@ class BoxFlow:
         patch = crop(image, box.sized(sides / per_pixel), (int(sides[0]), int(sides[1])))
         return np.asarray(cv2.cvtColor(patch, cv2.COLOR_BGR2GRAY))
 
-    def change(self, image: Image, centre: Floats, stood: Floats | None) -> tuple[float, float, float]:
-        """Factors of width and height, and turn [rad], since ``remember``.
+    def change(self, image: Image, box: OrientedBox, stood: Floats | None) -> tuple[float, float, float]:
+        """Factors of width and height, and turn [rad], since ``remember``, beyond those of ``box`` itself.
 
-        centre: (2,) of the target now; stood: (2,) where it were if it stood in the scene, if known [px].
+        box: as it is expected now; stood: (2,) where its centre were if it stood in the scene, if known [px].
         """
         none = (1.0, 1.0, 0.0)
         if self._old is None:
             return none
-        old, per_pixel, box = self._old
-        new = self._patch(image, box.at(centre), np.array(old.shape[::-1], dtype=np.float64), per_pixel)
+        old, per_pixel, last = self._old
+        per_pixel *= float(np.sqrt(np.prod(last.sides / box.sides)))
+        centre = box.centre
+        new = self._patch(image, box, np.array(old.shape[::-1], dtype=np.float64), per_pixel)
         unit = 0.9 * ((np.arange(_FLOW_GRID) + 0.5) / _FLOW_GRID - 0.5)
         gx, gy = np.meshgrid(unit * box.width * per_pixel, unit * box.height * per_pixel)
         middle = 0.5 * (np.array(old.shape[::-1]) - 1.0)

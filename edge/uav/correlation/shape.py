@@ -36,7 +36,6 @@ class Outline:
         self._inside_likelier = _likelier(lab)
         mask, share = self._component(lab)
         hull = _hull(mask)
-        inner = hull[(np.abs(hull) <= 0.5 + 1e-9).all(axis=1)] if hull is not None else None
         self.measures = False
         if hull is None:
             return
@@ -44,7 +43,10 @@ class Outline:
         both = np.prod(np.clip(np.minimum(high, 0.5) - np.maximum(low, -0.5), 0.0, None))
         overlap = float(both / (np.prod(high - low) + 1.0 - both))
         self.measures = overlap > _MEASURE_OVERLAP
-        if _MIN_SHARE < share < _MAX_SHARE and inner is not None and len(inner) >= 3:
+        square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]], np.float32)
+        _, inside = cv2.intersectConvexConvex(hull.astype(np.float32), square)
+        if _MIN_SHARE < share < _MAX_SHARE and inside is not None:
+            inner = inside.reshape(-1, 2).astype(np.float64)
             low, high = inner.min(axis=0), inner.max(axis=0)
             if (high - low).min() > _MIN_REACH:
                 self.points = np.asarray((inner - low) / (high - low) - 0.5)
