@@ -1,7 +1,7 @@
 """Manoeuvre model: an abrupt change of velocity as a second hypothesis beside the white-acceleration model.
 
 Examples are a bouncing ball, a waved wand, a drone that is hit, somebody who stops, sets off or sits down. The
-manoeuvre hypothesis is that the velocity, and a standing person's height, changed once, at an unknown time since the
+manoeuvre hypothesis is that the velocity, or a standing person's height, changed once, at an unknown time since the
 target was last observed. It has its own covariance, and each frame weighs the two hypotheses by their likelihoods.
 """
 
@@ -41,7 +41,7 @@ def can_manoeuvre(targets: Targets) -> Bools:
 
 
 def manoeuvre_hypothesis(
-    targets: Targets, elapsed: Floats | float, units_per_m: float, up: Floats | None = None
+    targets: Targets, elapsed: Floats | float, units_per_m: float, up: Floats | None = None, posture: bool = False
 ) -> ManoeuvreHypothesis:
     """The covariances under one velocity change within a time, and the prior odds of a change.
 
@@ -49,9 +49,11 @@ def manoeuvre_hypothesis(
     along which upright targets do not change their velocity. The time of the change is uniform over the time t, so the
     position variance grows by v t² / 3 and its covariance with the velocity by v t / 2, where v is the variance of the
     velocity change. An upright target may also have taken a step and stand again: a change that lasted for a part of a
-    step's duration, or of t where that is shorter, uniform as well, adds v / 3 times its square. One that stands may
-    have another height, with its feet where they were. That is as large for short t: sitting down takes a second, and
-    at many frames a second no two of them show it.
+    step's duration, or of t where that is shorter, uniform as well, adds v / 3 times its square.
+
+    posture: whether an upright target that stands may also have another height since, with its feet where they were.
+    That is as large for short t: sitting down takes a second, and at many frames a second no two of them show it. Where
+    past and future are compared both heights are known well; a filter that goes forward alone keeps up without it.
     """
     time = np.broadcast_to(np.asarray(elapsed, dtype=np.float64), (len(targets),))
     std = _MANOEUVRE_STD[targets.kind] * units_of(targets, units_per_m)
@@ -65,7 +67,7 @@ def manoeuvre_hypothesis(
     covariance[:, POSITION, VELOCITY] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, POSITION] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, VELOCITY] += change
-    if up is not None:
+    if posture and up is not None:
         lower = np.zeros_like(targets.mean)
         lower[:, POSITION], lower[:, LOG_SIZE] = 0.5 * np.exp(targets.mean[:, LOG_SIZE, None]) * up, 1.0
         speed = np.linalg.norm(targets.mean[:, VELOCITY], axis=1) / units_of(targets, units_per_m)
@@ -124,8 +126,8 @@ def continuation_hypotheses(
 ) -> tuple[Floats, tuple[tuple[Floats, Floats], tuple[Floats, Floats]], Floats]:
     """Whether futures continue pasts, without and with a manoeuvre: log likelihoods (2, n), the covariances (n, 7, 7)
     of past and future in both cases, and the prior odds (n,) of a manoeuvre. Arguments as in `fused_predictions`."""
-    one = manoeuvre_hypothesis(past, elapsed[0], units_per_m, up)
-    two = manoeuvre_hypothesis(future, -elapsed[1], units_per_m, up)
+    one = manoeuvre_hypothesis(past, elapsed[0], units_per_m, up, posture=True)
+    two = manoeuvre_hypothesis(future, -elapsed[1], units_per_m, up, posture=True)
     covariances = (past.covariance, future.covariance), (one.covariance, two.covariance)
     fit = np.array([kalman.log_density(past.mean - future.mean, a + b) for a, b in covariances])
     return fit, covariances, one.prior_odds + two.prior_odds

@@ -196,11 +196,12 @@ def test_identities_survive_two_seconds_without_detections(traffic: Traffic) -> 
 def test_people_who_were_exchanged_in_a_meeting_are_exchanged_back() -> None:
     """At 3 frames a second, who walks towards another and stops is where the other was expected.
 
-    Without the second hypothesis IDF1 is 0.970 here.
+    Without the second hypothesis IDF1 is 0.956 here.
     """
     known = hall.simulated(723, people=28, fps=3.0, seconds=10.0)
     scores = score_tracks(known.truth, hall.live(known), known.times, 1.0)
-    assert float(scores["idf1"] or 0.0) > 0.99
+    assert float(scores["idf1"] or 0.0) > 0.97
+    assert scores["switches"] == 0
 
 
 def test_the_first_instant_is_published_with_all_its_cameras() -> None:
