@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge.lens.board import BoardView
+from edge.lens.board import MIN_CORNERS, BoardView
 from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Ints
@@ -30,6 +30,9 @@ _MAX_RMS = 1.0  # px, at a width of up to 1280
 _MAX_FOCAL_STD = 0.004  # relative
 _PRINCIPAL_POINT_STD = 0.012  # of the larger image side, of usual cameras about the middle
 _FEW_FLAGS = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
+_REACHES = (np.inf, 85.0, 75.0, 65.0)
+"""Degrees from the middle of a picture, were it 180 wide, within which corners count: 85 are 90 of one of 190, 65 of
+one of 250."""
 _OUTLIER_RATIO = 2.5  # times the median view's rms
 _SHAPE = 4  # parameters of a board's shape: of a quadratic surface, and the rows' distance over the columns', less 1
 _MISSHAPEN, _CONVERGED, _MAX_ROUNDS = {3: 16.27, 4: 18.47}, 1e-6, 20
@@ -109,6 +112,7 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
     corners = np.concatenate([view.points for view in views])
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     accepted = [replace(views[i], points=views[i].points - middle) for i in chosen]
+    accepted = _ahead(accepted, size) if fisheye else accepted
     cells = _corner_counts(accepted, size)
     coverage = float((cells > 0).mean())
     if coverage < _MIN_COVERAGE and not few:
@@ -231,6 +235,26 @@ def _fisheye(views: list[BoardView], size: tuple[int, int]) -> _Fit:
         raise Refused("no fisheye fits these views: tilt the board in different directions")
     _, *fit = min(fits, key=lambda fit: float(np.nan_to_num(fit[0], nan=np.inf)))
     return _flat(fit, 4)
+
+
+def _ahead(views: list[BoardView], size: tuple[int, int]) -> list[BoardView]:
+    """The views with the corners that are surely before the camera, where the fit fails with all of them.
+
+    OpenCV finds no pose of a board with corners 90 degrees from the optical axis, and several such views end it.
+    """
+    middle, focal = 0.5 * (np.array(size) - 1.0), intrinsics_from_field_of_view(size, 180.0, True).focal
+    for degrees in _REACHES:
+        inside = [np.linalg.norm(view.pixels - middle, axis=1) < focal * np.deg2rad(degrees) for view in views]
+        kept = [
+            replace(view, points=view.points[one], pixels=view.pixels[one])
+            for view, one in zip(views, inside, strict=True)
+            if one.sum() >= MIN_CORNERS and np.linalg.matrix_rank(np.diff(view.points[one], axis=0)) == 2
+        ]
+        if len(kept) >= _LEAST_VIEWS:
+            with suppress(Refused):
+                _fisheye(kept, size)
+                return kept
+    return views
 
 
 def _flat(fit: list[Any], count: int) -> _Fit:

@@ -192,7 +192,7 @@ class BatchSmoother:
                 births = prior_of_births(self.tracks.select(entering), self.floor, self.parameters)
                 predicted = predicted.concatenate(births)
             said = self.evidence[index].total.of(_places(self.evidence[index].row, rows))
-            manoeuvre = manoeuvre_hypothesis(predicted, elapsed, units, up)
+            manoeuvre = manoeuvre_hypothesis(predicted, elapsed, units, up, posture=True)
             widened = widened_by_evidence(predicted, manoeuvre, said.information, said.vector)
             mean, covariance = self._updated(index, rows, predicted.mean, widened)
             running = replace(predicted, mean=mean, covariance=covariance)
@@ -475,7 +475,7 @@ class BatchSmoother:
         future = replace(self.tracks.select(tails), mean=after.mean[rows], covariance=after.covariance[rows])
         typical = float(np.median(self.tracks.mean[:, LOG_SIZE]))
         units = self.parameters.scale.units_per_m
-        manoeuvre = manoeuvre_hypothesis(past, ahead, units, self.parameters.up)
+        manoeuvre = manoeuvre_hypothesis(past, ahead, units, self.parameters.up, posture=True)
         rates = self._rates.log_exit(heads, seen), self._rates.log_entry(tails, future.mean[:, POSITION])
         return continuation_scores(past, future, manoeuvre, gap, rates, units, typical, self.colour_std)
 

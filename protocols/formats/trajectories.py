@@ -27,19 +27,24 @@ _WORLD = "sync_index,object_id,keypoint_id,x_coord,y_coord,z_coord,frame_time"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrajectoryGrid:
-    """Trajectories on one grid of constant rate [Hz]. cells: (n, 3 labels) x, y, z of each label; NaN = a gap."""
+    """Trajectories on one grid of constant rate [Hz]. cells: (n, 3 labels) x, y, z of each label; NaN = a gap.
+    begin: reference time of the first row [s]."""
 
     labels: tuple[str, ...]
+    begin: float
     rate: float
     cells: Floats
 
 
 def read_grid(file: Path, units: str, wanted: str) -> TrajectoryGrid:
     """A trajectory.csv or track.csv in ``wanted`` units on a grid. Raises InputError: file, line, what, remedy."""
-    remedy = "give the trajectory.csv of `calibrate` or the track.csv of `triangulate`"
+    remedy = "give the trajectory.csv of `calibrate`, the track.csv of `triangulate` or the tracks.csv of `follow`"
     paths = read_labelled_rows(file, ("time", "x", "y", "z"), remedy)
     if not paths:
         raise InputError("no rows", file=file, line=1, remedy=remedy)
+    for label, path in paths.items():
+        if len(np.unique(path[:, 0])) < len(path):
+            raise InputError(f"{label} has several rows of one time", file=file, remedy=f"name what moves; {remedy}")
     times, frames = grid_frames(paths)
     count = int(frames[-1]) + 1
     rate = (count - 1) / float(times[-1] - times[0]) if count > 1 else 1.0
@@ -48,13 +53,13 @@ def read_grid(file: Path, units: str, wanted: str) -> TrajectoryGrid:
     for column, path in enumerate(paths.values()):
         at = frames[np.clip(np.searchsorted(times, path[:, 0] - 1e-6), 0, len(times) - 1)]
         cells[at, 3 * column : 3 * column + 3] = scale * path[:, 1:4]
-    return TrajectoryGrid(tuple(paths), rate, cells)
+    return TrajectoryGrid(tuple(paths), float(times[0]), rate, cells)
 
 
-def trc_text(file: Path, name: str, units: str) -> str:
-    """A trajectory.csv or track.csv as TRC (OpenSim): constant rate, empty where a label has no position, m or mm.
+def trc_text(file: Path, name: str, units: str) -> tuple[str, float]:
+    """A trajectory as TRC (OpenSim): constant rate, empty where a label has no position, m or mm.
 
-    Time 0 is the first row. Raises InputError: file, line, what, remedy.
+    Time 0 is the first row, whose reference time [s] is returned too. Raises InputError: file, line, what, remedy.
     """
     written_units = "m" if units == "cm" else units
     grid = read_grid(file, units, written_units)
@@ -72,13 +77,14 @@ def trc_text(file: Path, name: str, units: str) -> str:
     for index, row in enumerate(cells):
         shown = "\t".join("" if math.isnan(value) else f"{value:.9g}" for value in row)
         lines.append(f"{index + 1}\t{index / rate:.9g}\t{shown}")
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n", grid.begin
 
 
-def write_c3d(source: Path, out: Path, units: str) -> None:
-    """Write a trajectory.csv or track.csv as a C3D file at its constant rate, through ezc3d; gaps have residual -1.
+def write_c3d(source: Path, out: Path, units: str) -> float:
+    """Write a trajectory as a C3D file at its constant rate, through ezc3d; gaps have residual -1.
 
-    units: of the trajectory; C3D files are in millimetres. Raises InputError.
+    units: of the trajectory; C3D files are in millimetres. Returns the first row's reference time [s]. Raises
+    InputError.
     """
     try:
         import ezc3d
@@ -101,6 +107,7 @@ def write_c3d(source: Path, out: Path, units: str) -> None:
             file.write(str(part))
     except (OSError, RuntimeError) as error:
         raise InputError(f"cannot be written: {error}", file=out, remedy="choose another --out") from None
+    return grid.begin
 
 
 def grid_frames(paths: Mapping[str, Floats]) -> tuple[Floats, Ints]:

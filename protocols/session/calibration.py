@@ -327,7 +327,10 @@ def read_trajectory(file: Path) -> tuple[TrajectoryTable, ...]:
 
 
 def read_labelled_rows(file: Path, columns: Sequence[str], remedy: str) -> dict[str, Floats]:
-    """The numbers (n, columns) of each label of a trajectory. Raises InputError: file, line, what, remedy."""
+    """The numbers (n, columns) of each label of a trajectory, or of each track (person1) of `follow`'s tracks.csv.
+
+    Raises InputError: file, line, what, remedy.
+    """
     reader = csv.DictReader(io.StringIO(read_text(file, "trajectory")))
     rows: dict[str, list[list[float]]] = {}
     try:
@@ -342,7 +345,8 @@ def read_labelled_rows(file: Path, columns: Sequence[str], remedy: str) -> dict[
                 raise InputError(what, file=file, line=reader.line_num, remedy=remedy) from None
             if not np.isfinite(values).all():
                 raise InputError("a number is not finite", file=file, line=reader.line_num, remedy=remedy)
-            rows.setdefault(row.get("label") or DEFAULT_LABEL, []).append(values)
+            track = f"{row.get('kind') or ''}{row.get('id') or ''}"
+            rows.setdefault(row.get("label") or track or DEFAULT_LABEL, []).append(values)
     except csv.Error as error:
         raise InputError(f"cannot be read: {error}", file=file, remedy=remedy) from None
     return {label: np.array(listed) for label, listed in rows.items()}

@@ -21,7 +21,7 @@ def export(
     to: Format | None = None,
     out: Path,
     session: Path | None = None,
-    units: Literal["m", "cm", "mm"] = "m",
+    units: Literal["m", "cm", "mm"] | None = None,
     json: Json = False,
     seed: UnusedSeed = 0,
 ) -> int:
@@ -46,7 +46,7 @@ def export(
     Parameters
     ----------
     source
-        calibration.toml; trajectory.csv or track.csv for trc and c3d; a .mcap log for session.
+        calibration.toml; trajectory.csv, track.csv or tracks.csv for trc and c3d; a .mcap log for session.
     to
         The format; for a .mcap log always session.
     out
@@ -55,7 +55,7 @@ def export(
         For caliscope: a session folder, an observations file or a log, whose points are written too, as a capture
         volume: camera_array.toml, image_points.csv (an xy.csv) and world_points.csv, at instants common to all cameras.
     units
-        Length unit of a trajectory, for trc and c3d.
+        For trc and c3d: the length unit that the trajectory has. Default: what result.json beside it says, else m.
     """
     from deploy.offline.exchange import exports
     from protocols.core.files import check_folder, write_together
@@ -85,10 +85,14 @@ def export(
         else:
             check_file(out, "a file", source)
         texts: dict[Path, str] = {}
-        if to == "c3d":
-            write_c3d(source, out, units)
-        elif to == "trc":
-            texts = {out: trc_text(source, out.name, units)}
+        if to in ("c3d", "trc"):
+            has, warnings = exports.trajectory_units(source, units)
+            if to == "c3d":
+                begin = write_c3d(source, out, has)
+            else:
+                text, begin = trc_text(source, out.name, has)
+                texts = {out: text}
+            warnings += (f"{to} files begin at time 0: that is {begin:.6f} s of the reference clock",) if begin else ()
         elif session is not None:
             texts, warnings = exports.caliscope_volume(source, session, out)
         else:

@@ -94,4 +94,4 @@ def _save(result: TriangulationResult, out: Path) -> None:
         if suffix == ".c3d":
             write_c3d(table, out, result.rig.units)
         else:
-            write_atomically(out, trc_text(table, out.name, result.rig.units))
+            write_atomically(out, trc_text(table, out.name, result.rig.units)[0])

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+from deploy.offline.follow.results import RESULT, TRACKS
 from protocols.core.errors import InputError
-from protocols.core.files import file_in
+from protocols.core.files import file_in, read_text
 from protocols.formats import colmap, opensfm, toml_rigs, trajectories, xml_rigs, yaml_rigs
 from protocols.formats.cameras import ExportedFiles, convert_units
 from protocols.session.calibration import read_calibration
+from protocols.session.result import TRAJECTORY_FILE
 from protocols.session.rig import METRES_PER_UNIT
 
 IN_FOLDERS = ("opencv", "ros", "colmap")
@@ -60,6 +63,29 @@ def caliscope_volume(source: Path, session: Path, out: Path) -> tuple[dict[Path,
         METRES_PER_UNIT[rig.units] if metric else 1.0,
     )
     return texts | {out / name: text for name, text in tables.items()}, (*warnings, *found.warnings, *note)
+
+
+def trajectory_units(source: Path, given: str | None) -> tuple[str, tuple[str, ...]]:
+    """The units of a trajectory, by the result.json of the command that wrote it or as given, and warnings on them.
+
+    Raises InputError where both are there and differ.
+    """
+    result = source.parent / RESULT
+    if source.name not in (TRAJECTORY_FILE, TRACKS) or not result.is_file():
+        return given or "m", () if given else (f"{source.name} states no units: m is assumed; --units gives another",)
+    try:
+        document = json.loads(read_text(result))
+        stated = document.get("metadata", document)
+        units, metric = stated["units"], stated.get("scale") != "arbitrary"
+        metres = METRES_PER_UNIT[units]
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise InputError("states no units of the trajectory", file=result, remedy="repeat the command") from None
+    if not metric:
+        return given or units, (f"the trajectory has no scale: its lengths are baselines, not {given or units}",)
+    if given and METRES_PER_UNIT[given] != metres:
+        remedy = "leave out --units, which says what the trajectory has, not what is written"
+        raise InputError(f"the trajectory is in {units}, not {given}", file=result, remedy=remedy)
+    return units, ()
 
 
 def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:

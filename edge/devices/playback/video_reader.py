@@ -66,6 +66,7 @@ class VideoInfo:
 class VideoReader:
     """Iterates over the frames of a video file, or of an image folder in the order of names, 1/``fps`` apart.
 
+    Images of a folder are all turned as the first one's EXIF orientation says.
     corrupt: number of frames that could not be decoded so far. repaired: number of frames without a usable time stamp,
     placed one period after their predecessor. resized: number of frames of another size than the first, which are left
     out. cut: what a file that ends too early lacks, in words; "" = nothing.
@@ -108,8 +109,11 @@ class VideoReader:
 
     def _folder_info(self, fps: float) -> VideoInfo:
         for file in self._image_files:
-            image = read_image(file)
-            if image is not None:
+            image, shown = read_image(file), read_image(file, cv2.IMREAD_COLOR)
+            if image is not None and shown is not None:
+                # Which way the first is turned, so are all: they are of one lens, however the camera was held.
+                self._turns = next((k for k in range(4) if np.array_equal(np.rot90(image, k), shown)), 0)
+                image = np.rot90(image, self._turns)
                 return VideoInfo((image.shape[1], image.shape[0]), fps, len(self._image_files))
         raise InputError("none of its images can be read", file=self.path, remedy="replace them")
 
@@ -117,6 +121,8 @@ class VideoReader:
         frame = 0
         for index, file in enumerate(self._image_files):
             image = read_image(file)
+            if image is not None:
+                image = np.ascontiguousarray(np.rot90(image, self._turns))
             if image is None or (image.shape[1], image.shape[0]) != self.info.size:
                 if self._strict:
                     size = (
@@ -242,10 +248,11 @@ def image_files(folder: Path) -> list[Path]:
     return files
 
 
-def read_image(file: Path) -> Image | None:
-    """The image (h, w, 3) BGR of a file; None if it cannot be decoded or is larger than OpenCV's limit."""
+def read_image(file: Path, flags: int = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) -> Image | None:
+    """The image (h, w, 3) BGR of a file, by default as the sensor gave it; None if it cannot be decoded or is larger
+    than OpenCV's limit."""
     try:
-        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+        image = cv2.imread(str(file), flags)
     except cv2.error:
         return None
     return None if image is None else np.asarray(image, dtype=np.uint8)

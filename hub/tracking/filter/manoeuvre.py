@@ -1,8 +1,8 @@
 """Manoeuvre model: an abrupt change of velocity as a second hypothesis beside the white-acceleration model.
 
-Examples are a bouncing ball, a waved wand, a drone that is hit, somebody who stops or sets off. The manoeuvre
-hypothesis is that the velocity changed once, at an unknown time since the target was last observed. It has its own
-covariance, and each frame weighs the two hypotheses by their likelihoods.
+Examples are a bouncing ball, a waved wand, a drone that is hit, somebody who stops, sets off or sits down. The
+manoeuvre hypothesis is that the velocity, or a standing person's height, changed once, at an unknown time since the
+target was last observed. It has its own covariance, and each frame weighs the two hypotheses by their likelihoods.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ _MAX_SPREAD_M = 0.7
 """Std of the position after a change: beyond, the target could be anywhere, and track initiation must find it again."""
 _MAX_LOG_ODDS = 50.0  # of a manoeuvre: after a pause of hours the odds exceed any float; these are certain already
 _STEP_S = 0.5  # of one step: 120 a minute
+_POSTURE_STD = 0.2  # of the log of a person's height: who sits is a quarter lower than who stands
+_STANDING_M_S = 0.25  # a slow turn's speed; nobody sits down or stands up while walking
 _MANOEUVRE_STD = np.array([model.manoeuvre_std_m_s for model in TARGET_MODELS])
 _MANOEUVRE_RATE = np.array([model.manoeuvres_per_s for model in TARGET_MODELS])
 
@@ -39,7 +41,7 @@ def can_manoeuvre(targets: Targets) -> Bools:
 
 
 def manoeuvre_hypothesis(
-    targets: Targets, elapsed: Floats | float, units_per_m: float, up: Floats | None = None
+    targets: Targets, elapsed: Floats | float, units_per_m: float, up: Floats | None = None, posture: bool = False
 ) -> ManoeuvreHypothesis:
     """The covariances under one velocity change within a time, and the prior odds of a change.
 
@@ -48,6 +50,10 @@ def manoeuvre_hypothesis(
     position variance grows by v t² / 3 and its covariance with the velocity by v t / 2, where v is the variance of the
     velocity change. An upright target may also have taken a step and stand again: a change that lasted for a part of a
     step's duration, or of t where that is shorter, uniform as well, adds v / 3 times its square.
+
+    posture: whether an upright target that stands may also have another height since, with its feet where they were.
+    That is as large for short t: sitting down takes a second, and at many frames a second no two of them show it. Where
+    past and future are compared both heights are known well; a filter that goes forward alone keeps up without it.
     """
     time = np.broadcast_to(np.asarray(elapsed, dtype=np.float64), (len(targets),))
     std = _MANOEUVRE_STD[targets.kind] * units_of(targets, units_per_m)
@@ -61,6 +67,12 @@ def manoeuvre_hypothesis(
     covariance[:, POSITION, VELOCITY] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, POSITION] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, VELOCITY] += change
+    if posture and up is not None:
+        lower = np.zeros_like(targets.mean)
+        lower[:, POSITION], lower[:, LOG_SIZE] = 0.5 * np.exp(targets.mean[:, LOG_SIZE, None]) * up, 1.0
+        speed = np.linalg.norm(targets.mean[:, VELOCITY], axis=1) / units_of(targets, units_per_m)
+        lower *= (UPRIGHT[targets.kind] * _POSTURE_STD / (1.0 + (speed / _STANDING_M_S) ** 2))[:, None]
+        covariance += lower[:, :, None] * lower[:, None, :]
     expected = np.minimum(_MANOEUVRE_RATE[targets.kind] * np.abs(time), _MAX_LOG_ODDS)
     return ManoeuvreHypothesis(covariance, np.expm1(expected))
 
@@ -114,8 +126,8 @@ def continuation_hypotheses(
 ) -> tuple[Floats, tuple[tuple[Floats, Floats], tuple[Floats, Floats]], Floats]:
     """Whether futures continue pasts, without and with a manoeuvre: log likelihoods (2, n), the covariances (n, 7, 7)
     of past and future in both cases, and the prior odds (n,) of a manoeuvre. Arguments as in `fused_predictions`."""
-    one = manoeuvre_hypothesis(past, elapsed[0], units_per_m, up)
-    two = manoeuvre_hypothesis(future, -elapsed[1], units_per_m, up)
+    one = manoeuvre_hypothesis(past, elapsed[0], units_per_m, up, posture=True)
+    two = manoeuvre_hypothesis(future, -elapsed[1], units_per_m, up, posture=True)
     covariances = (past.covariance, future.covariance), (one.covariance, two.covariance)
     fit = np.array([kalman.log_density(past.mean - future.mean, a + b) for a, b in covariances])
     return fit, covariances, one.prior_odds + two.prior_odds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -83,6 +84,40 @@ def test_a_trajectory_becomes_trc_with_empty_gaps(tmp_path: Path) -> None:
     assert [float(row[1]) for row in table] == pytest.approx([0, 0.02, 0.04, 0.06])
     assert table[1][2:] == ["0.04", "0.05", "0.06", "1", "0", "0"]
     assert table[2][2:] == [""] * 6
+
+
+def test_followed_people_are_one_marker_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of people at the same time the last row was written, all as one marker."""
+    csv, out = tmp_path / "tracks.csv", tmp_path / "people.trc"
+    rows = ["7.5,1,person,confirmed,1,2,0,1.7,1", "7.5,2,person,confirmed,3,4,0,1.7,1", "8,1,person,coasting,5,6,0,2,1"]
+    csv.write_text("\n".join(["time,id,kind,state,x,y,z,height,std", *rows]) + "\n")
+    assert run(["export", str(csv), "--to", "trc", "--out", str(out)]) == 0
+    lines = [line.split("\t") for line in out.read_text().splitlines()]
+    assert lines[3][2::3] == ["person1", "person2"]
+    assert [line[2:] for line in lines[6:]] == [["1", "2", "0", "3", "4", "0"], ["5", "6", "0", "", "", ""]]
+    shown = capsys.readouterr()
+    assert "7.500000 s of the reference clock" in shown.out + shown.err
+    csv.write_text(csv.read_text().replace(",id,", ",number,").replace(",kind,", ",of,"))
+    assert run(["export", str(csv), "--to", "trc", "--out", str(out)]) == 2
+    assert "marker has several rows of one time" in capsys.readouterr().err
+
+
+def test_a_trajectory_has_the_units_of_its_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One in centimetres was exported as metres, a hundred times too large, and one without scale as millimetres."""
+    csv, out, result = tmp_path / "trajectory.csv", tmp_path / "path.trc", tmp_path / "result.json"
+    csv.write_text("time,x,y,z,std\n0,100,200,300,1\n1,100,200,300,1\n")
+    result.write_text(json.dumps({"metadata": {"units": "cm", "scale": "metric"}}))
+    assert run(["export", str(csv), "--to", "trc", "--out", str(out)]) == 0
+    assert out.read_text().splitlines()[6].split("\t")[2:] == ["1", "2", "3"]
+    assert not capsys.readouterr().err
+    assert run(["export", str(csv), "--to", "trc", "--out", str(out), "--units", "mm"]) == 2
+    assert "the trajectory is in cm, not mm" in capsys.readouterr().err
+    result.write_text(json.dumps({"metadata": {"units": "m", "scale": "arbitrary"}}))
+    assert run(["export", str(csv), "--to", "trc", "--out", str(out)]) == 0
+    shown = capsys.readouterr()
+    assert "its lengths are baselines, not m" in shown.out + shown.err
+    result.write_text("{}")
+    assert run(["export", str(csv), "--to", "trc", "--out", str(out)]) == 2
 
 
 def test_a_file_of_another_kind_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

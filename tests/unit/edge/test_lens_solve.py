@@ -10,6 +10,7 @@ import pytest
 from edge.lens.board import BoardView
 from edge.lens.solve import calibrate_lens
 from protocols.core.errors import Refused
+from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from tests.support import boards
 
@@ -74,6 +75,28 @@ def test_fisheyes_of_any_field_of_view_are_found() -> None:
         lens, views = seen(seed, 16, 0.6, fisheye=True)
         found = calibrate_lens(views, SIZE, fisheye=True)
         assert abs(found.intrinsics.focal / lens.focal - 1.0) < 5.0 * found.focal_std < 0.02
+
+
+def test_a_board_in_the_corner_of_a_fisheye_of_190_degrees_is_no_hindrance() -> None:
+    """Of thirty views half had corners 90 degrees from the optical axis and more: no fisheye fitted any."""
+    size, rng, views = (640, 640), np.random.default_rng(2), []
+    focal = size[0] / np.radians(190.0)
+    for off_axis in np.radians([*np.linspace(5.0, 60.0, 15), *np.linspace(80.0, 115.0, 15)]):
+        azimuth = (
+            rng.uniform(0.0, 2.0 * np.pi) if off_axis < 1.5 else 0.25 * np.pi * rng.choice([-3, -1, 1, 3])
+        )  # corners of the picture
+        facing = so3.exp(off_axis * np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])) @ so3.exp(
+            rng.uniform(-0.5, 0.5, 3)
+        )
+        towards = np.array([np.cos(azimuth) * np.sin(off_axis), np.sin(azimuth) * np.sin(off_axis), np.cos(off_axis)])
+        x, y, z = ((CORNERS - [4.0, 3.0, 0.0]) @ facing.T + rng.uniform(6.0, 9.0) * towards).T
+        angle = np.arctan2(np.hypot(x, y), z) / np.hypot(x, y)
+        pixels = focal * angle[:, None] * np.column_stack([x, y]) + 319.5 + rng.normal(0.0, 0.1, (len(x), 2))
+        inside = ((pixels > 0.0) & (pixels < 639.0)).all(axis=1)
+        views.append(BoardView(0, CORNERS[inside], pixels[inside]))
+    found = calibrate_lens([view for view in views if len(view.points) >= 8], size, fisheye=True)
+    assert found.intrinsics.focal == pytest.approx(focal, rel=4.0 * found.focal_std)
+    assert found.views > 12
 
 
 @pytest.mark.parametrize(("count", "fisheye"), [(5, False), (24, False), (16, True)])

@@ -117,3 +117,20 @@ def test_unreadable_videos_are_refused_with_their_name(tmp_path: Path, name: str
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=name):
         VideoReader(tmp_path / name)
+
+
+def test_photographs_are_all_turned_as_the_first_is(tmp_path: Path) -> None:
+    """Each was turned by its own EXIF orientation: upside down the lens was another one, upright the size."""
+    scene = np.zeros((48, 64, 3), dtype=np.uint8)
+    scene[:24, :32] = 255
+    jpeg = cv2.imencode(".jpg", scene)[1].tobytes()
+    for name, orientation in (("1.jpg", 6), ("2.jpg", 1), ("3.jpg", 3)):
+        tag = struct.pack(">HHIHH", 0x0112, 3, 1, orientation, 0)
+        exif = b"Exif\0\0MM\0*" + struct.pack(">IH", 8, 1) + tag + bytes(4)
+        (tmp_path / name).write_bytes(jpeg[:2] + struct.pack(">HH", 0xFFE1, len(exif) + 2) + exif + jpeg[2:])
+    reader = VideoReader(tmp_path)
+    images = [frame.image() for frame in reader]
+    assert reader.info.size == (48, 64)
+    assert len(images) == 3
+    assert images[0][10, 40].min() > 200, "a quarter turn to the right"
+    assert all(np.array_equal(image, images[0]) for image in images)

@@ -129,6 +129,15 @@ def test_people_set_off_and_stop_along_the_ground_and_sometimes() -> None:
     assert 0.0 < manoeuvre.prior_odds[0] < 0.2
 
 
+def test_people_sit_down_and_stand_up_with_their_feet_where_they_are() -> None:
+    person, up = seen_before("person", 0.1), np.array([0.0, 0.0, 1.0])
+    added = manoeuvre_hypothesis(person, 0.1, 1.0, up, posture=True).covariance[0] - np.eye(STATE_DIM)
+    assert added[6, 6] > 0.15**2
+    foot = np.zeros(STATE_DIM)
+    foot[2], foot[6] = 1.0, -0.5  # of a person of size 1: height of the centre less half the height
+    assert foot @ added @ foot == pytest.approx(0.0, abs=1e-12)
+
+
 def test_who_runs_turns_harder_than_who_walks() -> None:
     """Players of a team sport who turned got a second number; walkers are predicted as before."""
     still = seen_before("person", 0.0)
