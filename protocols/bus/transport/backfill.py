@@ -15,7 +15,8 @@ Zenoh's advanced subscriber (1.10.2) does both as well, and fails in three cases
 Therefore it is not asked for the history: a publisher that appears is queried for what it has, one whose first message
 is not number 0 for the earlier ones, and one whose sequence numbers have a gap is queried for it until the cache has
 confirmed that it has no more of it. Its messages are held back meanwhile. A witness confirms that the query reached the
-cache: a message that it must have.
+cache: a message that it must have. A history is fetched in parts, the newest first: a router closes a link on which
+more waits than passes within seconds, and where the time is up what was fetched continues in what comes by itself.
 
 What a sender says of its publisher's identity and numbers is not authenticated, only its right to a key is. So nothing
 that is learned on one key has an effect on another, and a number far ahead of all others silences nobody: while a gap
@@ -35,12 +36,18 @@ _Source = TypeVar("_Source", bound=Hashable)
 
 GAP_TIMEOUT_S = 30.0
 """After this the missing messages of a gap count as lost."""
+HISTORY_TIMEOUT_S, SILENCE_S = 10.0, 2.0
+"""The same for a history: what comes by itself waits for it. And where messages come by themselves, but no reply, which
+a link would bring before them."""
 RETRY_S = 0.3
 """Pause between two queries for one gap."""
 _MAX_SOURCES, _MAX_OF_KEY = 16_384, 16
 """Publishers that are remembered, and of these of one key: an agent that restarts again and again has as many."""
 _MAX_BYTES, _MAX_BYTES_OF_KEY = 64 * 1024 * 1024, 8 * 1024 * 1024
 """Bytes held back at once, of all publishers together and of one."""
+_PART = 256
+"""Messages of a history that are queried at once: 0.1 to 0.5 MB. 200 publishers' 1,000 each took 2.7 s with 512, 3.2 s
+with 256 and 7 s with 128."""
 _SEQUENCE_MODULUS = 2**32  # Zenoh's sequence numbers have 32 bits
 NEWEST = _SEQUENCE_MODULUS // 2 - 1
 """As the end of a query: all there is. Zenoh's cache takes a longer range for one that wraps around: empty."""
@@ -50,8 +57,9 @@ NEWEST = _SEQUENCE_MODULUS // 2 - 1
 class RecoveryQuery(Generic[_Source]):
     """A query to a publisher's cache for its messages low to high (inclusive).
 
-    witness: number of a message that it must have, queried after them; None = not needed. key: the publisher's key.
-    number: of the query, to be passed to ``finish`` with the end of its replies."""
+    witness: number of a message that it must have, queried after them; None = not known. key: the publisher's key.
+    number: of the query, to be passed to ``finish`` with the end of its replies. most: only so many of them, the
+    newest; None = a gap, of which all are wanted."""
 
     source: _Source
     key: str
@@ -59,6 +67,7 @@ class RecoveryQuery(Generic[_Source]):
     high: int
     witness: int | None
     number: int
+    most: int | None = None
 
 
 @dataclass(slots=True)
@@ -70,13 +79,22 @@ class _PendingMessages:
     joining: bool
     since: float
     question: int
+    high: int
+    """Up to which it is queried: of a history, what is not yet fetched."""
     due: float | None = None
     """When to query again; None while a query is open."""
+    heard: float = 0.0
+    """When the first message came by itself."""
     continued: bool = False
     """Whether messages that continue those before the gap arrived meanwhile."""
     early: dict[int, bytes] = field(default_factory=dict)
     later: deque[tuple[int, bytes]] = field(default_factory=deque)
     bytes: int = 0
+
+    @property
+    def witness(self) -> int | None:
+        """The newest message that is known: by the time of the reply the cache may have dropped older ones."""
+        return self.later[-1][0] if self.later else max(self.early, default=None)
 
 
 class Backfill(Generic[_Source]):
@@ -146,19 +164,23 @@ class Backfill(Generic[_Source]):
                 self._keep(held, len(payload))
 
     def finish(self, query: RecoveryQuery[_Source], served: bool) -> None:
-        """Process the end of a query's replies. served: its witness was among them; of a history, nothing failed."""
+        """Process the end of a query's replies. served: its witness was among them, or without one no error."""
         who = query.key, query.source
         with self._lock:
             held = self._held.get(who)
             if held is None or held.question != query.number:
                 return
-            if held.joining and not served and max(held.early, default=-1) >= query.low:
-                # A slow link: it goes on where its time was up.
-                follow: RecoveryQuery[_Source] | None = self._question(who, held)
-            elif held.joining or served or len(held.early) == held.first - held.low:
+            follow: RecoveryQuery[_Source] | None = None
+            part = sum(query.low <= number <= query.high for number in held.early)
+            if query.most is not None and served and part >= query.most:
+                held.high = min(held.early) - 1
+                follow = self._question(who, held)
+            elif held.joining and served and not part and query.witness is None and held.later:
+                follow = self._question(who, held)  # now there is a witness: did the connection break?
+            elif served or len(held.early) == held.first - held.low:
                 follow = self._release(who)
             else:
-                held.due, follow = self._clock() + RETRY_S, None
+                held.due = self._clock() + RETRY_S
         if follow is not None:
             self._ask(follow)
 
@@ -171,7 +193,9 @@ class Backfill(Generic[_Source]):
         with self._lock:
             for who, held in list(self._held.items()):
                 too_much = held.bytes > _MAX_BYTES_OF_KEY or self._bytes > _MAX_BYTES
-                if too_much or (not held.joining and now - held.since > GAP_TIMEOUT_S):
+                silent = held.joining and held.later and not held.early and now - held.heard > SILENCE_S
+                late = now - held.since > (HISTORY_TIMEOUT_S if held.joining else GAP_TIMEOUT_S)
+                if too_much or silent or late:
                     follow = self._release(who)
                 elif held.due is not None and now >= held.due:
                     follow = self._question(who, held)
@@ -196,8 +220,7 @@ class Backfill(Generic[_Source]):
                 # A publisher's numbers arrive in order: what came first was another's.
                 self._bytes -= self._held.pop(who).bytes
                 return self._begin(who, number, payload)
-            held.later.append((number, payload))
-            self._keep(held, len(payload))
+            self._append(held, number, payload)
             return None
         if expected is None:
             self._remember(who)
@@ -223,11 +246,10 @@ class Backfill(Generic[_Source]):
         self, who: tuple[str, _Source], low: int, first: int, payload: bytes | None = None, *, joining: bool
     ) -> RecoveryQuery[_Source]:
         """payload: of message ``first``, None where none has arrived."""
-        held = self._held[who] = _PendingMessages(low, first, joining, self._clock(), 0)
+        held = self._held[who] = _PendingMessages(low, first, joining, self._clock(), 0, first - 1)
         self._next[who] = -1  # no message is in sequence while these are held back
         if payload is not None:
-            held.later.append((first, payload))
-            self._keep(held, len(payload))
+            self._append(held, first, payload)
         return self._question(who, held)
 
     def _continue(self, who: tuple[str, _Source], held: _PendingMessages, payload: bytes) -> None:
@@ -243,10 +265,8 @@ class Backfill(Generic[_Source]):
     def _question(self, who: tuple[str, _Source], held: _PendingMessages) -> RecoveryQuery[_Source]:
         self._questions += 1
         held.question, held.due = self._questions, None
-        # The newest one: by the time of the reply the cache may have dropped older ones.
-        witness = None if held.joining else held.later[-1][0]
-        low = max(held.early, default=held.low - 1) + 1 if held.joining else held.low  # a cache answers in order
-        return RecoveryQuery(who[1], who[0], low, held.first - 1, witness, held.question)
+        most = _PART if held.joining else None
+        return RecoveryQuery(who[1], who[0], held.low, held.high, held.witness, held.question, most)
 
     def _release(self, who: tuple[str, _Source]) -> RecoveryQuery[_Source] | None:
         """Deliver everything in order up to the next gap, and return the query for that gap."""
@@ -285,6 +305,11 @@ class Backfill(Generic[_Source]):
                 expected = (number + 1) % _SEQUENCE_MODULUS
         self._next[who] = expected
         return None
+
+    def _append(self, held: _PendingMessages, number: int, payload: bytes) -> None:
+        held.heard = held.heard if held.later else self._clock()
+        held.later.append((number, payload))
+        self._keep(held, len(payload))
 
     def _keep(self, held: _PendingMessages, size: int) -> None:
         held.bytes += size

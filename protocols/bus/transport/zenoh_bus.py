@@ -8,6 +8,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from queue import SimpleQueue
 from typing import Any, TypeAlias
 
@@ -18,7 +19,7 @@ from google.protobuf.message import Message
 
 from protocols.bus.base import BusDead, Received
 from protocols.bus.settings import BusConfig
-from protocols.bus.transport.backfill import GAP_TIMEOUT_S, NEWEST, Backfill, RecoveryQuery
+from protocols.bus.transport.backfill import NEWEST, SILENCE_S, Backfill, RecoveryQuery
 from protocols.bus.transport.inbox import Arrived, InboxSubscription, LivenessTracker, subscription_key
 from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
 from protocols.core.closing import Closing
@@ -32,7 +33,6 @@ _POLL_S = 0.005  # for a matching subscriber
 _HISTORIES_AT_ONCE, _HISTORIES_OF_KEY = 16, 2
 """In all, and of one key: who does not answer delays no other. Of 200 publishers 1,000 messages each took 2.4 s
 with 1 to 16 at once; with 64 and more the link stalled for seconds, and queries ended without a reply."""
-_HISTORY_TURN_S = 2.0  # after it a query for a history counts no more among them: its publisher is slow, or silent
 _GAP_QUERY_S = 10.0  # a third of GAP_TIMEOUT_S: three queries before it is lost
 _CHANNEL, _AT_ONCE = 512, 256
 """Samples between Zenoh and a subscription's thread, 3 ms of a flood: while it is full, Zenoh waits. And of these taken
@@ -141,6 +141,17 @@ class _DeclaredKeys:
                 self._session.undeclare(self._declared.pop())
 
 
+@dataclass(slots=True)
+class _OpenHistory:
+    """A query to a publisher's cache and the replies that were not read yet. failed: whether one was an error."""
+
+    question: RecoveryQuery[_Source]
+    begun: float
+    replies: deque[zenoh.Reply] = field(default_factory=lambda: deque(maxlen=_MAX_REPLIES))
+    failed: bool = False
+    reading: threading.Lock = field(default_factory=threading.Lock)
+
+
 class ZenohSubscription(InboxSubscription):
     """See ``protocols.bus.base.Subscription``."""
 
@@ -156,12 +167,12 @@ class ZenohSubscription(InboxSubscription):
         self._backfill: Backfill[_Source] = Backfill(self._push, self._questions.put, self.inbox.count_lost)
         self._histories: deque[RecoveryQuery[_Source]] = deque()
         """Queries that wait until another one has ended."""
-        self._open_histories: dict[int, tuple[str, float]] = {}
-        """Key and time of the begin of each query for a history, by its number."""
+        self._open_histories: dict[int, _OpenHistory] = {}
+        self._last_reply = 0.0  # to any of them
         self._counting = threading.Lock()
         self._newest: dict[tuple[str, _Source], int] = {}
         self._fetched: dict[tuple[str, _Source], int] = {}
-        """Number of the message that was taken from a publisher's cache; it may yet arrive by itself."""
+        """Number of the message that was taken from a publisher's cache; it and older ones may yet arrive."""
         self._keys = _DeclaredKeys(session)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         with zenoh_call(f"subscribe {key}"):
@@ -245,7 +256,7 @@ class ZenohSubscription(InboxSubscription):
         if self._reliable:
             return name, source.source_sn, key, payload
         self._count_gap((key, name), source.source_sn)
-        return (name, None, key, payload) if self._fetched.get((key, name)) != source.source_sn else None
+        return (name, None, key, payload) if self._fetched.get((key, name), -1) < source.source_sn else None
 
     def _count_gap(self, publisher: tuple[str, _Source], number: int) -> None:
         """Count the losses of a topic that is not recovered."""
@@ -271,26 +282,23 @@ class ZenohSubscription(InboxSubscription):
         """Query one publisher's cache; its replies arrive on a Zenoh thread."""
         source, lock, served = question.source, self._counting, False
         still_open = 1 if question.witness is None else 2
-        history = self._reliable and question.witness is None
+        opened = _OpenHistory(question, time.monotonic())
+        history = question.most is not None
         if history:
             with lock:
                 if not self._may_ask(question):
                     self._histories.append(question)
                     return
-                self._open_histories[question.number] = question.key, time.monotonic()
-
-        # Zenoh calls its method directly: with a function in Python in between, all took twice as long.
-        replies: deque[zenoh.Reply] = deque(maxlen=_MAX_REPLIES)
+                self._open_histories[question.number] = opened
 
         def witnessed(reply: zenoh.Reply) -> None:
             nonlocal served
             served = served or reply.ok is not None
 
         def done() -> None:
-            nonlocal still_open, served
-            complete = self._read(question, replies)
+            nonlocal still_open
+            self._read(opened)
             with lock:
-                served = served or (history and complete)
                 still_open -= 1
                 if still_open:
                     return
@@ -298,21 +306,24 @@ class ZenohSubscription(InboxSubscription):
             if history:
                 self._ask_next()
             if self._reliable:
-                self._backfill.finish(question, served)
+                self._backfill.finish(question, served or (question.witness is None and not opened.failed))
             self.inbox.push_all(self._arrived)
+
+        most = "" if question.most is None else f";_max={question.most}"
 
         def get(low: int, high: int, take: Callable[[zenoh.Reply], None]) -> None:
             with zenoh_call(f"fetch {question.key}"):
                 self._session.get(
-                    f"{question.key}{_ADVANCED}{source[0]}/{source[1]}/**?_sn={low}..{high}",
+                    f"{question.key}{_ADVANCED}{source[0]}/{source[1]}/**?_sn={low}..{high}{most}",
                     zenoh.handlers.Callback(take, drop=done, indirect=False),
                     consolidation=zenoh.ConsolidationMode.NONE,
                     accept_replies=zenoh.ReplyKeyExpr.ANY,
-                    timeout=GAP_TIMEOUT_S if question.witness is None else _GAP_QUERY_S,
+                    timeout=_GAP_QUERY_S,
                 )
 
         try:
-            get(question.low, question.high, replies.append)
+            # Zenoh calls its method directly: with a function in Python in between, all took twice as long.
+            get(question.low, question.high, opened.replies.append)
             if question.witness is not None:
                 # Sent after the other query on the same route: if this one is answered, so was that one.
                 get(question.witness, question.witness, witnessed)
@@ -321,8 +332,7 @@ class ZenohSubscription(InboxSubscription):
             self.inbox.push_all(self._arrived)
 
     def _may_ask(self, question: RecoveryQuery[_Source]) -> bool:
-        begun = time.monotonic() - _HISTORY_TURN_S
-        keys = [key for key, since in self._open_histories.values() if since > begun]
+        keys = [one.question.key for one in self._open_histories.values()]
         return keys.count(question.key) < _HISTORIES_OF_KEY and len(keys) < _HISTORIES_AT_ONCE
 
     def _ask_next(self) -> None:
@@ -332,26 +342,42 @@ class ZenohSubscription(InboxSubscription):
                 self._histories.remove(following)
                 self._questions.put(following)
 
-    def _read(self, question: RecoveryQuery[_Source], replies: deque[zenoh.Reply]) -> bool:
-        """Take the replies; whether none is an error, as Zenoh's when the time is up."""
-        complete = True
-        while replies:
-            sample = replies.popleft().ok
-            complete = complete and sample is not None
-            if sample is not None and sample.source_info is not None:
-                number, key = sample.source_info.source_sn, str(sample.key_expr)
-                if self._reliable:
-                    self._backfill.answer(question, number, key, sample.payload.to_bytes())
-                elif key == question.key:
-                    self._take_latest(question.source, key, number, sample.payload.to_bytes())
-        return complete
+    def _read_histories(self) -> None:
+        """Take what has come of them; those whose publishers do not answer no longer keep others waiting."""
+        now = time.monotonic()
+        with self._counting:
+            opened = list(self._open_histories.values())
+        for one in opened:
+            if one.replies:
+                self._last_reply = now
+                self._read(one)
+        silent = [one for one in opened if now - max(one.begun, self._last_reply) > SILENCE_S]
+        if silent:
+            with self._counting:
+                for one in silent:
+                    self._open_histories.pop(one.question.number, None)
+            self._ask_next()
+
+    def _read(self, opened: _OpenHistory) -> None:
+        question, replies = opened.question, opened.replies
+        with opened.reading:
+            while replies:
+                sample = replies.popleft().ok
+                if sample is None:  # as Zenoh's when the time is up
+                    opened.failed = True
+                elif sample.source_info is not None:
+                    number, key = sample.source_info.source_sn, str(sample.key_expr)
+                    if self._reliable:
+                        self._backfill.answer(question, number, key, sample.payload.to_bytes())
+                    elif key == question.key:
+                        self._take_latest(question.source, key, number, sample.payload.to_bytes())
 
     def drain(self) -> list[Received]:
         """Everything since the last call."""
         self._keys.declare()
         self._backfill.poll()
-        if self._histories:
-            self._ask_next()
+        if self._open_histories:
+            self._read_histories()
         if self._arrived:
             self.inbox.push_all(self._arrived)
         with self._turn:

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from protocols.bus.transport.backfill import GAP_TIMEOUT_S, NEWEST, RETRY_S, Backfill, RecoveryQuery
+from protocols.bus.transport.backfill import (
+    GAP_TIMEOUT_S,
+    HISTORY_TIMEOUT_S,
+    NEWEST,
+    RETRY_S,
+    SILENCE_S,
+    Backfill,
+    RecoveryQuery,
+)
 
 
 class Stage:
@@ -86,8 +94,8 @@ def test_who_appears_again_is_asked_for_what_is_new() -> None:
     stage.answer(3, 4)
     assert stage.out == names(0, 1, 2, 3, 4, 5)
     stage.backfill.appeared("a", "key-a")
-    stage.answer(served=False)
     stage.take("a", 6)
+    stage.after(SILENCE_S + 0.1)
     assert (stage.out[-1], stage.lost) == ("a6", 0), "also where no answer came"
     stage.backfill.appeared("a", "key-a")
     stage.answer(10, 11)
@@ -111,7 +119,7 @@ def test_a_reply_far_ahead_of_the_history_silences_nobody() -> None:
 def test_what_came_before_is_fetched_once_and_put_first() -> None:
     stage = Stage()
     stage.take("a", 3, 4)
-    assert [(q.key, q.source, q.low, q.high, q.witness) for q in stage.asked] == [("key-a", "a", 0, 2, None)]
+    assert [(q.key, q.source, q.low, q.high, q.witness) for q in stage.asked] == [("key-a", "a", 0, 2, 3)]
     stage.take("b", 0)
     assert stage.out == ["b0"], "others do not wait"
     stage.take("a", 5)
@@ -127,7 +135,7 @@ def test_a_late_joiner_without_an_answer_loses_nothing_but_time() -> None:
     stage.take("a", 3)
     stage.after(0.0)
     assert stage.out == []
-    stage.answer(served=False)
+    stage.after(SILENCE_S + 0.1)
     assert stage.out == names(3)
     stage.answer(2)
     stage.take("a", 4)
@@ -295,25 +303,37 @@ def test_a_forged_number_alone_does_not_outlast_what_the_camera_has_published() 
     assert stage.out == names(0, 1, 2, 3, 4)
 
 
-def test_a_history_whose_time_is_up_goes_on_where_it_stopped() -> None:
-    """A slow link, where all of it takes longer than one query may."""
+def test_a_history_is_fetched_in_parts_the_newest_first() -> None:
     stage = Stage()
     stage.backfill.appeared("a", "key-a")
-    stage.take("a", 7)
-    stage.answer(2, 3, 4, served=False)
-    assert (stage.out, [query.low for query in stage.asked]) == ([], [0, 5])
-    stage.answer(5, served=False)
-    assert stage.asked[-1].low == 6
-    stage.answer(6)
-    assert (stage.out, len(stage.asked), stage.lost) == (names(2, 3, 4, 5, 6, 7), 3, 0)
+    stage.take("a", 400)
+    stage.answer(*range(144, 400))
+    assert (stage.out, [query.high for query in stage.asked]) == ([], [NEWEST, 143])
+    stage.answer(*range(100, 120), served=False)
+    stage.after(RETRY_S)
+    assert [query.high for query in stage.asked] == [NEWEST, 143, 143], "a part whose time is up is asked for again"
+    stage.answer(*range(100, 144))
+    assert (stage.out, len(stage.asked), stage.lost) == (names(*range(100, 401)), 3, 0)
 
 
-def test_a_history_that_brings_nothing_more_is_not_waited_for() -> None:
+def test_what_was_fetched_of_a_history_whose_time_is_up_continues_in_what_comes_by_itself() -> None:
     stage = Stage()
     stage.backfill.appeared("a", "key-a")
-    stage.take("a", 5)
-    stage.answer(2, 3, served=False)
+    stage.take("a", 400)
+    stage.answer(*range(144, 400))
+    stage.after(HISTORY_TIMEOUT_S + 0.1)
+    stage.take("a", 401)
+    assert (stage.out, stage.lost) == (names(*range(144, 402)), 0)
+
+
+def test_a_history_without_an_answer_of_which_messages_come_is_asked_for_again() -> None:
+    """Of a connection that broke, Zenoh tells only that there are no more replies."""
+    stage = Stage()
+    stage.backfill.appeared("a", "key-a")
+    stage.take("a", 8, 9)
+    stage.answer()
+    assert [query.witness for query in stage.asked] == [None, 9]
     stage.answer(served=False)
-    assert stage.out == names(2, 3)
-    stage.answer(4)  # and what is then missing is a gap like any other
-    assert (stage.out, stage.lost) == (names(2, 3, 4, 5), 0)
+    stage.after(RETRY_S)
+    stage.answer(6, 7, 8, 9)
+    assert stage.out == names(6, 7, 8, 9)
