@@ -37,8 +37,10 @@ MAX_BYTES = 1 << 30
 _MAX_DEPTH = 8
 """Of graphs within graphs."""
 _LOOPS = frozenset({"Loop", "Scan"})
-_CLASS_NAME = re.compile(r"[{,] *\d+: *['\"]")
+_CLASS_NAME = re.compile(r"[{,] *\d+: *(['\"])(?:\\.|[^\\])*?\1", re.DOTALL)
 """In Ultralytics' metadata ``names``: a dictionary {0: 'person', …} as Python prints it."""
+_MAX_NAMES = 1 << 20
+"""[bytes] of ``names`` that are read: as many classes as in the largest data sets (ImageNet: 21,841) of 48 each."""
 _REMEDY = "export the model again"
 # The part of onnx.proto3 (onnx.ai, IR version 10) that is looked at: message → field → (number, type, repeated).
 _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
@@ -80,7 +82,7 @@ _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
         "external_data": (13, "Entry", True),
         "data_location": (14, "int64", False),
     },
-    "Entry": {"key": (1, "string", False), "value": (2, "string", False)},
+    "Entry": {"key": (1, "bytes", False), "value": (2, "bytes", False)},  # exporters write text of any encoding
 }
 
 
@@ -251,8 +253,8 @@ def check_model_file(file: Path) -> tuple[dict[str, list[int | str]], int]:
         for one in model.graph.input
         if one.name not in constants
     }
-    names = next((one.value for one in model.metadata_props if one.key == "names"), "")
-    return inputs, len(_CLASS_NAME.findall(names))
+    names = next((one.value for one in model.metadata_props if one.key == b"names"), b"")
+    return inputs, len(_CLASS_NAME.findall(names[:_MAX_NAMES].decode(errors="replace")))
 
 
 def _check_inputs(graph: Any, outer: frozenset[str], file: Path) -> None:
@@ -272,8 +274,8 @@ def _check_inputs(graph: Any, outer: frozenset[str], file: Path) -> None:
 
 def _external_size(tensor: Any, file: Path) -> int:
     """Size of the part of another file with a tensor's values. Raises InputError if it is not beside the model."""
-    entries = {entry.key: entry.value for entry in tensor.external_data}
-    place = entries.get("location", "")
+    entries = {entry.key: entry.value.decode(errors="replace") for entry in tensor.external_data}
+    place = entries.get(b"location", "")
     folder = file.resolve().parent
     try:
         data = (folder / place).resolve()
@@ -284,7 +286,7 @@ def _external_size(tensor: Any, file: Path) -> int:
     if not inside:
         what = f"the model's data {place[:80]!r} is not a file in the model's folder"
         raise InputError(what, file=file, remedy="put it there, or export the model as one file")
-    length = entries.get("length", "")
+    length = entries.get(b"length", "")
     return min(int(length), size) if length.isdigit() and len(length) < 19 else size
 
 
@@ -305,7 +307,7 @@ def _message(name: str) -> type[Any]:
     package = "syncline.onnx"
     file = descriptor_pb2.FileDescriptorProto(name="syncline_onnx.proto", package=package, syntax="proto3")
     kinds = descriptor_pb2.FieldDescriptorProto
-    scalars = {"int64": kinds.TYPE_INT64, "string": kinds.TYPE_STRING}
+    scalars = {"int64": kinds.TYPE_INT64, "string": kinds.TYPE_STRING, "bytes": kinds.TYPE_BYTES}
     for message, fields in _FIELDS.items():
         described = file.message_type.add(name=message)
         for field, (number, kind, repeated) in fields.items():

@@ -198,8 +198,9 @@ def test_classes_that_the_model_names_have_to_fit_the_layout(
     tmp_path: Path, toml: str, outputs: dict[str, Array], names: int, message: str
 ) -> None:
     model = constant_model(outputs)
-    model.metadata_props.add(key="names", value=str({k: f"it's {k}, or so" for k in range(names)}))
-    file = write_network(tmp_path, model, toml, CLASSES)
+    model.metadata_props.add(key="names", value=str({k: f"it's {k}, {k}: 'so' \xe4" for k in range(names)}))
+    content = model.SerializeToString().replace("\xe4".encode(), b"\xff\xfe")  # not UTF-8
+    file = write_network(tmp_path, content, toml, CLASSES)
     if message:
         with pytest.raises(InputError, match=message):
             load_detector(file)

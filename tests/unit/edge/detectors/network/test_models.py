@@ -171,6 +171,10 @@ def test_outputs_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(runtime, "MAX_OUTPUT", 999)
     with pytest.raises(InputError, match="outputs have more than 999 numbers"):
         load_detector(write_network(tmp_path, of_huge_outputs(1000)))
+    model = constant_model(NOTHING)
+    model.metadata_props.add(key="names", value=",0:''" * 10**6)
+    (tmp_path / "model.onnx").write_bytes(model.SerializeToString())
+    assert check_model_file(tmp_path / "model.onnx")[1] == runtime._MAX_NAMES // 5
 
 
 def test_external_data_beside_the_model_is_read_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
