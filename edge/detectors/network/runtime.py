@@ -27,6 +27,7 @@ Array = npt.NDArray[Any]
 MAX_OUTPUT = 50_000_000
 """Numbers in all outputs of one run: four times what YOLOv5 gives for 32 images of 640x640 in 9 classes (1.1e7)."""
 _INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+_SIZE_TYPES = _INPUT_TYPES | {"tensor(int32)": np.int32}
 _SIZE_INPUT = "orig_target_sizes"
 """Of the exports of RT-DETR, D-FINE and DEIM: (n, 2) width and height in which boxes are wanted [px]."""
 _MAX_MEMORY = 4 << 30
@@ -136,7 +137,8 @@ class OnnxRuntime:
         except Exception as error:  # noqa: BLE001 - onnxruntime's errors have no other common class
             raise _unusable(file, error) from None
         inputs = {one.name: one for one in self._session.get_inputs()}
-        self._size = np.array([size], dtype=np.int64) if inputs.pop(_SIZE_INPUT, None) else None
+        wanted = inputs.pop(_SIZE_INPUT, None)
+        self._size = None if wanted is None else np.array([size], dtype=_SIZE_TYPES.get(wanted.type, np.int64))
         (images,) = inputs.values()
         self._input, self.batch, self.classes = images.name, batch, classes
         if images.type not in _INPUT_TYPES:
