@@ -104,9 +104,13 @@ def test_a_companions_attitude_with_a_clock_of_its_own_does_not_touch_the_target
     last = flight.messages(pb.TargetState)[-1]
     truth = flight.world.truth(last.frame)
     assert np.hypot(last.centre[0] - truth.x, last.centre[1] - truth.y) < 10.0
+    other = mavlink.MAVLink(None, 2, 1)
+    wire.send(bytes(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(other)), None)
+    flight.run(flight.time + 0.15)
     status = flight.agent.status(0)
     assert status.counters["telemetry.refused.component"] == 10
     assert "ATTITUDE_QUATERNION of component 191 refused" in status.message
+    assert "; system 2 is on this link too" in status.message
     measured(f"attitude of a companion computer, {ahead_s:.0f} s ahead", "refused, target kept", "10 of 10 refused")
 
 

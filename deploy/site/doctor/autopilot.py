@@ -28,7 +28,7 @@ _LEAST_RATE = 0.5  # of the requested rate: one message in two may be lost
 class Heard:
     """What was heard on a link. samples: times of attitudes [s]. stations: ids of ground stations' heartbeats.
 
-    conflict: what else is on it. gimbal: whether one reports. ignores_unsigned: see ``Vehicle``.
+    second: the other autopilot on it. gimbal: whether one reports. ignores_unsigned: see ``Vehicle``.
     """
 
     firmware: str = "the autopilot"
@@ -37,7 +37,7 @@ class Heard:
     stations: set[int] = field(default_factory=set)
     parameters: dict[str, float] = field(default_factory=dict)
     refusal: str = ""
-    conflict: str = ""
+    second: str = ""
     gimbal: bool = False
     ignores_unsigned: bool = False
 
@@ -152,7 +152,7 @@ def listen(link: Any, hello: Any, *, gimbal: bool, rate_hz: float, seconds: floa
         link.wait(0.05)
     heard.synchronised = vehicle.clock.answered
     heard.ignores_unsigned = vehicle.ignores_unsigned
-    heard.refusal, heard.conflict = vehicle.problem(time.monotonic_ns()), link.report(time.monotonic_ns())
+    heard.refusal, heard.second = vehicle.problem(time.monotonic_ns()), link.second_autopilot(time.monotonic_ns())
     return heard
 
 
@@ -189,9 +189,9 @@ def telemetry(heard: Heard, *, gimbal: bool, rate_hz: float) -> CheckResult:
 
 def unused(heard: Heard, followed: int | None, *, gimbal: bool) -> Iterator[CheckResult]:
     """Warn of another vehicle, and of a gimbal, where neither is used and the settings may have meant it."""
-    if heard.conflict:
+    if heard.second:
         remedy = "set vehicle in [mavlink] to the system that carries the camera"
-        yield warn("vehicle", f"system {followed} is followed; {heard.conflict}", remedy)
+        yield warn("vehicle", f"system {followed} is followed; {heard.second}", remedy)
     if heard.gimbal and not gimbal:
         remedy = 'set mount = "gimbal" if the camera hangs on it'
         yield warn("gimbal", 'a gimbal reports its attitude, which mount = "fixed" does not use', remedy)

@@ -13,8 +13,8 @@ coefficients:
     separate   boxes (B, N, 4), scores (B, N), labels (B, N): RT-DETR, torchvision
 
 For one image the axis of the batch may be missing in all of them. Of detections the other order of the last two axes is
-recognised: there are more candidates than values of each. Of the last two layouts, ``keypoints`` is (B, N, K, V) or
-(B, N, P).
+recognised: there are more candidates than values of each, or as many as YOLOX has cells. Of the last two layouts,
+``keypoints`` is (B, N, K, V) or (B, N, P).
 """
 
 from __future__ import annotations
@@ -198,10 +198,11 @@ def _rows(values: Array, channels_first: bool) -> Array:
 def _dense(parts: dict[str, Array], description: NetworkDescription, file: Path) -> _Candidates:
     """yolov5, yolov8 and yolox."""
     objectness = description.layout != "yolov8"
-    rows = _rows(parts["detections"], not objectness)
+    cells = _yolox_cells(*description.input) if description.layout == "yolox" else None
+    given = parts["detections"]
+    rows = given if cells is not None and len(given) == len(cells) else _rows(given, not objectness)
     begin = _FIRST_CLASS[description.layout]
     end = rows.shape[1] - _extra(description)
-    cells = _yolox_cells(*description.input) if description.layout == "yolox" else None
     if end <= begin or (cells is not None and len(cells) != len(rows)):
         raise _not_as_described(parts, description, file)
     score, label = _best_class(rows[:, begin:end], description, file)

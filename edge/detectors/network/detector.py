@@ -72,15 +72,16 @@ class NetworkDetector:
 
         A model that takes one image at a time, though its file says any number, is given one at a time.
         """
+        found = None
         if not self._singly:
             try:
                 found = self._infer(images)
             except InputError:
                 if len(images) == 1:
                     raise
-                self._singly = True
-        if self._singly:
+        if found is None:
             found = [one for image in images for one in self._infer([image])]
+            self._singly = True
         return [self._detections(*one) for one in zip(images, found, times_s, strict=True)]
 
     def _infer(self, images: Sequence[Image]) -> list[tuple[Boxes, Resize]]:

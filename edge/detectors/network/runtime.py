@@ -27,6 +27,7 @@ Array = npt.NDArray[Any]
 MAX_OUTPUT = 50_000_000
 """Numbers in all outputs of one run: four times what YOLOv5 gives for 32 images of 640x640 in 9 classes (1.1e7)."""
 _INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+_SIZE_TYPES = _INPUT_TYPES | {"tensor(int32)": np.int32}
 _SIZE_INPUT = "orig_target_sizes"
 """Of the exports of RT-DETR, D-FINE and DEIM: (n, 2) width and height in which boxes are wanted [px]."""
 _MAX_MEMORY = 4 << 30
@@ -37,8 +38,10 @@ MAX_BYTES = 1 << 30
 _MAX_DEPTH = 8
 """Of graphs within graphs."""
 _LOOPS = frozenset({"Loop", "Scan"})
-_CLASS_NAME = re.compile(r"[{,] *\d+: *['\"]")
+_CLASS_NAME = re.compile(r"[{,] *\d+: *(['\"])(?:\\.|[^\\])*?\1", re.DOTALL)
 """In Ultralytics' metadata ``names``: a dictionary {0: 'person', …} as Python prints it."""
+_MAX_NAMES = 1 << 20
+"""[bytes] of ``names`` that are read: as many classes as in the largest data sets (ImageNet: 21,841) of 48 each."""
 _REMEDY = "export the model again"
 # The part of onnx.proto3 (onnx.ai, IR version 10) that is looked at: message → field → (number, type, repeated).
 _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
@@ -80,7 +83,7 @@ _FIELDS: dict[str, dict[str, tuple[int, str, bool]]] = {
         "external_data": (13, "Entry", True),
         "data_location": (14, "int64", False),
     },
-    "Entry": {"key": (1, "string", False), "value": (2, "string", False)},
+    "Entry": {"key": (1, "bytes", False), "value": (2, "bytes", False)},  # exporters write text of any encoding
 }
 
 
@@ -134,7 +137,8 @@ class OnnxRuntime:
         except Exception as error:  # noqa: BLE001 - onnxruntime's errors have no other common class
             raise _unusable(file, error) from None
         inputs = {one.name: one for one in self._session.get_inputs()}
-        self._size = np.array([size], dtype=np.int64) if inputs.pop(_SIZE_INPUT, None) else None
+        wanted = inputs.pop(_SIZE_INPUT, None)
+        self._size = None if wanted is None else np.array([size], dtype=_SIZE_TYPES.get(wanted.type, np.int64))
         (images,) = inputs.values()
         self._input, self.batch, self.classes = images.name, batch, classes
         if images.type not in _INPUT_TYPES:
@@ -251,8 +255,8 @@ def check_model_file(file: Path) -> tuple[dict[str, list[int | str]], int]:
         for one in model.graph.input
         if one.name not in constants
     }
-    names = next((one.value for one in model.metadata_props if one.key == "names"), "")
-    return inputs, len(_CLASS_NAME.findall(names))
+    names = next((one.value for one in model.metadata_props if one.key == b"names"), b"")
+    return inputs, len(_CLASS_NAME.findall(names[:_MAX_NAMES].decode(errors="replace")))
 
 
 def _check_inputs(graph: Any, outer: frozenset[str], file: Path) -> None:
@@ -272,8 +276,8 @@ def _check_inputs(graph: Any, outer: frozenset[str], file: Path) -> None:
 
 def _external_size(tensor: Any, file: Path) -> int:
     """Size of the part of another file with a tensor's values. Raises InputError if it is not beside the model."""
-    entries = {entry.key: entry.value for entry in tensor.external_data}
-    place = entries.get("location", "")
+    entries = {entry.key: entry.value.decode(errors="replace") for entry in tensor.external_data}
+    place = entries.get(b"location", "")
     folder = file.resolve().parent
     try:
         data = (folder / place).resolve()
@@ -284,7 +288,7 @@ def _external_size(tensor: Any, file: Path) -> int:
     if not inside:
         what = f"the model's data {place[:80]!r} is not a file in the model's folder"
         raise InputError(what, file=file, remedy="put it there, or export the model as one file")
-    length = entries.get("length", "")
+    length = entries.get(b"length", "")
     return min(int(length), size) if length.isdigit() and len(length) < 19 else size
 
 
@@ -305,7 +309,7 @@ def _message(name: str) -> type[Any]:
     package = "syncline.onnx"
     file = descriptor_pb2.FileDescriptorProto(name="syncline_onnx.proto", package=package, syntax="proto3")
     kinds = descriptor_pb2.FieldDescriptorProto
-    scalars = {"int64": kinds.TYPE_INT64, "string": kinds.TYPE_STRING}
+    scalars = {"int64": kinds.TYPE_INT64, "string": kinds.TYPE_STRING, "bytes": kinds.TYPE_BYTES}
     for message, fields in _FIELDS.items():
         described = file.message_type.add(name=message)
         for field, (number, kind, repeated) in fields.items():

@@ -27,6 +27,8 @@ _TCP_SILENT_NS = 10 * NANOSECONDS  # ten heartbeats, after which a connection wh
 _LEAST_GARBLED = 1000  # bytes without a message, a second of a slow port: not the start of one in the middle
 _MIN_RETRY_S, _MAX_RETRY_S = 0.2, 1.0  # doubled up to, until the device or address is there
 _CONFLICT_SHOWN_NS = 10 * NANOSECONDS
+_NO_VEHICLES = frozenset({mavlink.MAV_TYPE_ANTENNA_TRACKER, mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ADSB})
+"""Types of what may send as an autopilot's component, with an autopilot's name."""
 _GARBLED = "bytes arrive, but no MAVLink messages: check the baud rate, and what the port speaks"
 _NAN_ALLOWED = frozenset({"COMMAND_LONG", "COMMAND_INT", "GIMBAL_MANAGER_SET_PITCHYAW", "CAMERA_TRACKING_IMAGE_STATUS",
                           "CAMERA_TRACKING_GEO_STATUS", "CAMERA_FOV_STATUS", "VIDEO_STREAM_INFORMATION",
@@ -97,7 +99,7 @@ class Link:
         self._identity = Evidence()
         self._first: tuple[Address, int, Evidence] | None = None
         self._candidates: dict[tuple[Address, int], Evidence] = {}
-        self._conflict = (-_CONFLICT_SHOWN_NS, "")
+        self._conflict = self._second = (-_CONFLICT_SHOWN_NS, "")
         self.vehicle = vehicle
         self.last_received_ns = 0
         self.counters: Counter[str] = Counter()
@@ -170,11 +172,16 @@ class Link:
                 self._signing.save()
 
     def report(self, now_ns: int) -> str:
-        """Who else is or claims to be the vehicle, or why the signing times are not stored; "" if there is nothing."""
+        """Who else claims to be the vehicle, or why the signing times are not stored; "" if there is nothing."""
         since, text = self._conflict
         if now_ns - since < _CONFLICT_SHOWN_NS:
             return text
         return "" if self._signing is None else self._signing.problem
+
+    def second_autopilot(self, now_ns: int) -> str:
+        """Which other vehicle's autopilot is on the link, where ``vehicle`` is not set; "" if there is none."""
+        since, text = self._second
+        return text if now_ns - since < _CONFLICT_SHOWN_NS else ""
 
     def _flush(self, now: int) -> None:
         """Send what the link has room for."""
@@ -227,8 +234,6 @@ class Link:
             if reason is not None:
                 self._reject(reason, address, component, now)
                 return None
-        elif frame[0] == V2 and frame[2] & SIGNED:
-            self.counters["signed"] += 1  # which cannot be verified
         if kind not in self._allowed:
             self.counters["not_needed"] += 1
             return None
@@ -247,6 +252,8 @@ class Link:
         if system == self.vehicle and component == AUTOPILOT:
             self.last_received_ns, self._reply_address, self.problem = now, None, ""
             self._identity.add(message, now)
+            if self._signing is None and frame[0] == V2 and frame[2] & SIGNED:
+                self.counters["signed"] += 1  # which cannot be verified
         self.counters["received"] += 1
         return ReceivedMessage(message, kind, system, component, now)
 
@@ -282,7 +289,7 @@ class Link:
         if silent_ns <= _SILENT_NS and not returned:
             if beats and not self._fixed:  # another vehicle behind the same router
                 text = f"system {system} is on this link too, and is not followed (vehicle in [mavlink] chooses)"
-                self._conflict = (now, text)
+                self._second = (now, text)
             return
         if returned:
             objection = ""
@@ -317,7 +324,8 @@ class Link:
             self._first = (address, system, identity)
         self._address, self.vehicle, self._identity = address, system, identity
         self._candidates.clear()
-        self._conflict, self.problem = (-_CONFLICT_SHOWN_NS, ""), ""
+        self._conflict = self._second = (-_CONFLICT_SHOWN_NS, "")
+        self.problem = ""
         self.counters["locked"] += 1
 
     def _try_open(self) -> None:
@@ -352,8 +360,9 @@ class Link:
 
 
 def is_autopilot(message: Any, component: int) -> bool:
-    """Whether a heartbeat comes from an autopilot rather than a station, a camera or a gimbal."""
-    return component == AUTOPILOT and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+    """Whether a heartbeat comes from a vehicle's autopilot rather than a station, a camera or a gimbal."""
+    flies = message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and message.type not in _NO_VEHICLES
+    return component == AUTOPILOT and flies
 
 
 def _all_finite(message: Any) -> bool:

@@ -63,9 +63,10 @@ class StatusTexts:
 
     def stop(self, station: int) -> StatusText | None:
         """A station stops tracking. The text if another one had selected the target."""
-        if self._operator in (None, station) or self._announced == "idle":
+        previous, self._operator = self._operator, None
+        if previous in (None, station) or self._announced in ("idle", "lost"):
             return None
-        return f"Syncline: station {station} stops what {self._operator} tracks", mavlink.MAV_SEVERITY_NOTICE
+        return f"Syncline: station {station} stops what {previous} tracks", mavlink.MAV_SEVERITY_NOTICE
 
     def update(self, state: str, now_s: float) -> StatusText | None:
         """The text that is due. state: as in ``TrackingStatus``."""

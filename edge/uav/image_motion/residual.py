@@ -115,7 +115,8 @@ class MovingParts:
         self._keep(image, time)
 
     def _keep(self, image: Image, time: float) -> None:
-        size = (image.shape[1] // self._reduction, image.shape[0] // self._reduction)
+        # At least a pixel: the box of a target that is away grows beyond the image with a view that zooms in.
+        size = (max(image.shape[1] // self._reduction, 1), max(image.shape[0] // self._reduction, 1))
         small = image if self._reduction == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         self._now = np.asarray(small, np.uint8)
         if not self._past or time - self._past[-1][0] > _KEEP_S:

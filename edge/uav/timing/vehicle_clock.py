@@ -54,7 +54,8 @@ class _Candidate:
 class VehicleClock:
     """The clock of one source. Times are integer ns. reboots, steps: how often it was restarted, or stepped.
 
-    rejected: round trips that were not used. reason: why the last message or round trip was refused; "" = it was not.
+    rejected: round trips that were not used. answered: whether one was ever used. reason: why the last message or round
+    trip was refused; "" = it was not.
     """
 
     def __init__(self) -> None:
@@ -67,6 +68,7 @@ class VehicleClock:
         self.reboots = 0
         self.steps = 0
         self.rejected = 0
+        self.answered = False
         self.reason = ""
 
     @property
@@ -78,11 +80,6 @@ class VehicleClock:
     def stamped(self) -> bool:
         """Whether a stamped message was accepted."""
         return self._newest_ns >= 0
-
-    @property
-    def answered(self) -> bool:
-        """Whether a round trip was measured."""
-        return bool(self._round_trips)
 
     def handle_message(self, vehicle_ns: int, host_ns: int) -> bool:
         """Add a message stamped ``vehicle_ns`` that arrived at ``host_ns``. False if it is refused; see ``reason``."""
@@ -132,6 +129,7 @@ class VehicleClock:
             self.steps += 1
         self._trip_candidate = None
         self._round_trips.append(bound)
+        self.answered = True
         return True
 
     def host_time(self, vehicle_ns: int) -> int:

@@ -411,9 +411,12 @@ def test_status_texts_say_what_happens_to_the_target() -> None:
     tracked(under_test, QGC)
     fly("visible", 1)
     stop = mavlink.MAV_CMD_CAMERA_STOP_TRACKING
-    for station, said in ((OTHER, ["Syncline: station 253 stops what 255 tracks"]), (QGC, [])):
+    for station, said in ((OTHER, ["Syncline: station 253 stops what 255 tracks"]), (OTHER, []), (QGC, [])):
         answers = under_test.command(stop, by=station)
         assert [m.text for m in answers if m.get_type() == "STATUSTEXT"] == said
+    tracked(under_test, QGC)
+    fly("lost", 1)
+    assert "STATUSTEXT" not in [m.get_type() for m in under_test.command(stop, by=OTHER)], "nothing is tracked"
     assert all(len(text) <= 50 for text, _ in camera_role._TEXTS.values())
 
 

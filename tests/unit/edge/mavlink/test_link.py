@@ -48,8 +48,8 @@ class Sender:
         return data
 
 
-def heartbeat(autopilot: int = 3) -> Any:
-    return mavlink.MAVLink_heartbeat_message(2, autopilot, 0, 0, 4, 3)
+def heartbeat(autopilot: int = 3, kind: int = 2) -> Any:
+    return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3)
 
 
 def attitude(roll: float = 0.1, boot_ms: int = 1000) -> Any:
@@ -99,15 +99,30 @@ def test_messages_are_accepted_only_after_an_autopilots_heartbeat_and_from_that_
     vehicle.send(heartbeat())
     vehicle.send(attitude())
     assert kinds(link.poll()) == ["HEARTBEAT", "ATTITUDE"]
+    for kind in (mavlink.MAV_TYPE_ANTENNA_TRACKER, mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ADSB):
+        other.send(heartbeat(mavlink.MAV_AUTOPILOT_GENERIC, kind))
+    link.poll()
+    assert link.second_autopilot(time.monotonic_ns()) == ""
     other.send(heartbeat())
     assert link.poll() == []
     assert (link.vehicle, link.counters["refused.other_vehicle"]) == (1, 1)
-    assert link.report(time.monotonic_ns()).startswith("system 2 is on this link too, and is not followed")
+    assert link.second_autopilot(time.monotonic_ns()).startswith("system 2 is on this link too, and is not followed")
     chosen, pipe = make_link(vehicle=1)
     for system in (1, 2):
         Sender(pipe, system).send(heartbeat())
     chosen.poll()
-    assert (chosen.vehicle, chosen.report(time.monotonic_ns())) == (1, "")
+    assert (chosen.vehicle, chosen.second_autopilot(time.monotonic_ns())) == (1, "")
+
+
+def test_only_the_vehicles_own_signatures_are_counted() -> None:
+    link, pipe = make_link()
+    Sender(pipe).send(heartbeat())
+    Sender(pipe, system=255, component=190, key=KEY).send(heartbeat(autopilot=8))
+    link.poll()
+    assert link.counters["signed"] == 0
+    Sender(pipe, key=KEY).send(heartbeat())
+    link.poll()
+    assert link.counters["signed"] == 1
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])

@@ -285,6 +285,10 @@ def test_an_autopilot_that_signs_and_answers_nothing_is_named() -> None:
     boot_ns = round(1e9 * (4.0 + BOOT_S))
     under_test.take(mavlink.MAVLink_timesync_message(boot_ns, round(4e9 - 1e9 * DELAY_S)), 4.0)
     assert under_test.vehicle.problem(4_100_000_000) == ""
+    for k in range(50, 200):  # a reboot: the clock is another, the vehicle the same
+        under_test.attitude(0.1 * k, ahead_s=-120.0)
+    assert under_test.vehicle.clock_resets == (1, 0)
+    assert under_test.vehicle.problem(20_000_000_000) == ""
 
 
 def test_samples_are_later_than_each_other_and_never_later_than_their_arrival() -> None:

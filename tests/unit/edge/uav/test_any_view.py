@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -126,6 +128,19 @@ def test_the_box_turns_with_a_view_that_turns_from_the_first_image_on(scene: Ima
         found = tracker.begin(image, 0.0, Box(*low, *sides)) if k == 0 else tracker.handle_frame(image, k / FPS)
         assert [found.x, found.y] == pytest.approx(seen.mean(axis=0), abs=4.0)
         assert np.degrees(tracker.box.angle) == pytest.approx(-1.5 * k, abs=8.0)
+
+
+def test_the_box_of_a_target_that_is_away_may_grow_far_beyond_a_view_that_zooms_in(scene: Image) -> None:
+    image = scene[: SIZE[1], : SIZE[0]].copy()
+    tracker = AppearanceTracker(SIZE, FPS)
+    tracker.begin(image, 0.0, Box(150.0, 100.0, 40.0, 30.0))
+    tracker.handle_frame(None, 1.0 / FPS)
+    zoom = np.column_stack([1.07 * np.eye(2), -0.07 * tracker.box.centre])
+    tracker._scene.update = lambda image, hidden: replace(STILL, matrix=zoom, trusted=True)  # type: ignore[method-assign]
+    for k in range(2, 80):
+        tracker._searching = True
+        tracker.handle_frame(np.full_like(image, 90), k / FPS)
+    assert tracker.box.width == pytest.approx(40.0 * 1.07**78)  # and shrinks again with it
 
 
 def test_an_outline_is_cut_at_its_box_and_keeps_the_corners_beyond_it(scene: Image) -> None:

@@ -11,6 +11,7 @@ from onnx import helper, numpy_helper
 from edge.detectors.base import BatchDetector, Detection
 from edge.detectors.network.decode import decode
 from edge.detectors.network.description import NetworkDescription
+from edge.detectors.network.detector import NetworkDetector
 from edge.detectors.plugins import load_detector
 from protocols.core.errors import InputError
 from tests.support.networks import Array, constant_model, write_network
@@ -64,6 +65,9 @@ OUTPUTS = {
     'layout = "yolov5"': {"output0": table(True)[None]},
     'layout = "yolov5" # turned': {"output0": table(True).T[None]},
     'layout = "yolox"': {"output0": cell_relative(table(True))[None]},
+    'layout = "yolox" # fewer cells than values': {
+        "output0": np.hstack([cell_relative(table(True)), np.zeros((62, 77))])[None]
+    },
     'layout = "yolov8"\nmask_coefficients = 2': {"output0": np.hstack([table(False), np.full((94, 2), 7.0)]).T[None]},
     'layout = "end2end"': {"output0": [[lone(PERSON, 0.9, 0), lone(TRUCK, 0.6, 2), lone(PERSON, 0.8, 1)]]},
     'layout = "detr"': {
@@ -198,8 +202,9 @@ def test_classes_that_the_model_names_have_to_fit_the_layout(
     tmp_path: Path, toml: str, outputs: dict[str, Array], names: int, message: str
 ) -> None:
     model = constant_model(outputs)
-    model.metadata_props.add(key="names", value=str({k: f"it's {k}, or so" for k in range(names)}))
-    file = write_network(tmp_path, model, toml, CLASSES)
+    model.metadata_props.add(key="names", value=str({k: f"it's {k}, {k}: 'so' \xe4" for k in range(names)}))
+    content = model.SerializeToString().replace("\xe4".encode(), b"\xff\xfe")  # not UTF-8
+    file = write_network(tmp_path, content, toml, CLASSES)
     if message:
         with pytest.raises(InputError, match=message):
             load_detector(file)
@@ -232,8 +237,21 @@ def test_a_model_that_takes_one_image_though_it_declares_any_number_gets_one(tmp
     model.graph.node[0].input[0] = "image"
     model.graph.node.insert(0, helper.make_node("Reshape", ["images", "one"], ["image"]))
     detector = load_detector(write_network(tmp_path, model, "", CLASSES))
-    assert isinstance(detector, BatchDetector)
-    assert [len(found) for found in detector.detect_batch([IMAGE] * 3, [0.0, 0.1, 0.2])] == [2, 2, 2]
+    assert isinstance(detector, NetworkDetector)
+    run, ran = detector._runtime.run, []
+
+    def failing(images: Array) -> dict[str, Array]:
+        ran.append(len(images))
+        if len(ran) <= 2:
+            raise InputError("no memory for anything")
+        return run(images)
+
+    detector._runtime.run = failing  # type: ignore[method-assign]
+    with pytest.raises(InputError, match="no memory"):
+        detector.detect_batch([IMAGE] * 3, [0.0, 0.1, 0.2])
+    for _ in range(2):
+        assert [len(found) for found in detector.detect_batch([IMAGE] * 3, [0.0, 0.1, 0.2])] == [2, 2, 2]
+    assert ran == [3, 1, 3, 1, 1, 1, 1, 1, 1], "a failure of another reason is no reason to go one by one"
 
 
 @pytest.mark.parametrize(

@@ -63,10 +63,10 @@ def two_inputs() -> onnx.ModelProto:
     return model
 
 
-def of_wanted_size() -> onnx.ModelProto:
+def of_wanted_size(kind: int = TensorProto.INT64) -> onnx.ModelProto:
     """A model that gives one box as large as its second input says, as RT-DETR's own export does."""
     images = helper.make_tensor_value_info("images", TensorProto.FLOAT, ["n", 3, 48, 64])
-    size = helper.make_tensor_value_info("orig_target_sizes", TensorProto.INT64, ["n", 2])
+    size = helper.make_tensor_value_info("orig_target_sizes", kind, ["n", 2])
     names = {"boxes": ["n", 1, 4], "scores": ["n", 1], "labels": ["n", 1]}
     stored = [numpy_helper.from_array(np.array(part), name) for name, part in (("1", [1]), ("n4", [-1, 1, 4]))]
     nodes = [
@@ -158,9 +158,10 @@ def test_opencv_refuses_them_too(tmp_path: Path, model: onnx.ModelProto | bytes,
         load_detector(write_network(tmp_path, model, 'backend = "opencv"'))
 
 
-def test_a_model_that_asks_for_the_size_of_its_boxes_gets_that_of_its_input(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", [TensorProto.INT64, TensorProto.INT32, TensorProto.FLOAT])
+def test_a_model_that_asks_for_the_size_of_its_boxes_gets_that_of_its_input(tmp_path: Path, kind: int) -> None:
     toml = 'layout = "separate"\nresize = "stretch"'
-    detector = load_detector(write_network(tmp_path, of_wanted_size(), toml))
+    detector = load_detector(write_network(tmp_path, of_wanted_size(kind), toml))
     (person,) = detector.detect(np.zeros((480, 640, 3), np.uint8))
     assert person.box == pytest.approx((0.0, 0.0, 640.0, 480.0))
     with pytest.raises(InputError, match="OpenCV does not run models with orig_target_sizes"):
@@ -171,6 +172,10 @@ def test_outputs_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(runtime, "MAX_OUTPUT", 999)
     with pytest.raises(InputError, match="outputs have more than 999 numbers"):
         load_detector(write_network(tmp_path, of_huge_outputs(1000)))
+    model = constant_model(NOTHING)
+    model.metadata_props.add(key="names", value=",0:''" * 10**6)
+    (tmp_path / "model.onnx").write_bytes(model.SerializeToString())
+    assert check_model_file(tmp_path / "model.onnx")[1] == runtime._MAX_NAMES // 5
 
 
 def test_external_data_beside_the_model_is_read_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
