@@ -126,7 +126,7 @@ def test_an_inverted_board_is_found_without_a_setting(tmp_path: Path, capsys: Ca
 def test_few_views_or_none_are_refused(tmp_path: Path, capsys: Capture) -> None:
     video = render_board(tmp_path / "few", "charuco", False, count=2)
     assert run(command(video, tmp_path / "rig.toml", "charuco")) == 3
-    assert "2 different views" in capsys.readouterr().err
+    assert "2 different views, 3 give an approximate lens, 8 a good one" in capsys.readouterr().err
     assert run([*command(video, tmp_path / "rig.toml", "charuco"), "--dictionary", "6X6_50"]) == 3
     assert "in no frame" in capsys.readouterr().err
 
