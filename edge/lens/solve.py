@@ -106,7 +106,8 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
     held = few and not fisheye
     if len(views) < _LEAST_VIEWS:
         found = f"the board is seen in {len(views)} different views"
-        raise Refused(f"{found}, {MIN_VIEWS} are needed: film it longer, or {_CHECK_BOARD}")
+        need = f"{_LEAST_VIEWS} give an approximate lens, {MIN_VIEWS} a good one"
+        raise Refused(f"{found}, {need}: film it longer, or {_CHECK_BOARD}")
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MAX_VIEWS)).round().astype(int))
     # About the board's middle: elsewhere the slope of a bow would be a stretch.
     corners = np.concatenate([view.points for view in views])

@@ -43,7 +43,7 @@ from hub.tracking.filter.manoeuvre import (
     units_of,
     within_reach,
 )
-from hub.tracking.filter.measurement import PredictedMeasurement, measurements_of, predict_measurement
+from hub.tracking.filter.measurement import NOISE_ENTRIES, PredictedMeasurement, measurements_of, predict_measurement
 from hub.tracking.filter.prediction import on_floor, predict_targets
 from hub.tracking.filter.target_models import KIND_INDEX, TARGET_MODELS, UPRIGHT
 from hub.tracking.filter.target_states import DetectionStatistics, MultiTargetState, Scan, ScanFrame, Targets
@@ -171,7 +171,7 @@ def _associate_and_update(
     targets, variance, name = state.targets, state.colour_variance, frame.camera.name
     none = np.zeros(0, dtype=np.int64)
     if not len(targets):
-        seen = ScanFrame(frame, value, noise, statistics, none, none, True)
+        seen = ScanFrame(frame, value, noise[:, *NOISE_ENTRIES], statistics, none, none, True)
         statistics = updated_statistics(
             statistics, *(none.astype(np.bool_),) * 3, float(len(frame)), np.zeros(0), none.astype(np.bool_)
         )
@@ -238,7 +238,7 @@ def _associate_and_update(
     )
     assert state.scan is not None
     ids = targets.initiation_number[row]
-    seen = ScanFrame(frame, value, noise, statistics, ids, column, ambiguous)
+    seen = ScanFrame(frame, value, noise[:, *NOISE_ENTRIES], statistics, ids, column, ambiguous)
     state = replace(state, scan=replace(state.scan, frames=(*state.scan.frames, seen)))
     return state, np.flatnonzero(free & (clutter > 0.5))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from hub.tracking.association.initiation import LengthScale
 from hub.tracking.calibration.vertical import VerticalEstimator
-from hub.tracking.detections import TrackingCamera, frame_detections
+from hub.tracking.detections import FrameDetections, TrackingCamera, frame_detections
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import MultiTargetState, Targets
@@ -107,60 +108,77 @@ def follow(
     # Who has left is known from the whole recording: until its end nobody is given up soon.
     parameters = TrackerParameters(up=up, scale=scale, lifetime_s=60.0)
     said = progress or (lambda share: None)
-    state = MultiTargetState.empty()
-    recorded: list[MultiTargetState] = []
-    for index, frame in enumerate(frames):
-        if state.scan is not None and any(one.frame.camera.name == frame.camera.name for one in state.scan.frames):
-            state = jointly(state, parameters)
-            recorded.append(state)
-        state = process_frame(state, frame, cameras, parameters)
-        if index % 50 == 0:
-            said(0.5 * index / len(frames))
-    recorded.append(jointly(state, parameters))
-    smoother = _smoother(recorded, parameters)
+    recorded, state = _tracked(frames, cameras, parameters, lambda share: said(0.5 * share))
+    del frames
+    smoother = _smoother(recorded, state, parameters)
     scans = smoother.run(progress=lambda share: said(0.5 + 0.5 * share)) if smoother is not None else []
     tracks = _sampled(smoother, scans, np.asarray(times_ns, dtype=np.int64), up) if smoother is not None else ()
     summaries = _summaries(smoother, state, cameras)
     return FollowResult(tracks, summaries, (*warnings, *_unused(summaries)))
 
 
-def _smoother(recorded: list[MultiTargetState], parameters: TrackerParameters) -> BatchSmoother | None:
-    """The recording's scans with the tracker's associations; rows of tracks by track number."""
-    last = recorded[-1]
+def _tracked(
+    frames: Sequence[FrameDetections],
+    cameras: dict[str, TrackingCamera],
+    parameters: TrackerParameters,
+    progress: Callable[[float], None],
+) -> tuple[deque[tuple[RecordedScan, Targets]], MultiTargetState]:
+    """Of each scan what the live tracker finds, and its last state."""
+    state, recorded = MultiTargetState.empty(), deque[tuple[RecordedScan, Targets]]()
+    for index, frame in enumerate(frames):
+        if state.scan is not None and any(one.frame.camera.name == frame.camera.name for one in state.scan.frames):
+            state = jointly(state, parameters)
+            recorded.append(_recorded(state))
+        state = process_frame(state, frame, cameras, parameters)
+        if index % 50 == 0:
+            progress(index / len(frames))
+    state = jointly(state, parameters)
+    recorded.append(_recorded(state))
+    return recorded, state
+
+
+def _recorded(state: MultiTargetState) -> tuple[RecordedScan, Targets]:
+    """What the smoother needs of a state: with all of it an hour would not fit into memory."""
+    assert state.scan is not None
+    assert state.time_ns is not None
+    return RecordedScan(state.time_ns, state.scan.frames), state.targets
+
+
+def _smoother(
+    recorded: deque[tuple[RecordedScan, Targets]], last: MultiTargetState, parameters: TrackerParameters
+) -> BatchSmoother | None:
+    """The recording's scans with the tracker's associations; rows of tracks by track number. Empties ``recorded``."""
     number: dict[int, int] = {}
-    for state in recorded:
-        named = state.targets.confirmed
-        number |= dict(
-            zip(state.targets.initiation_number[named].tolist(), state.targets.number[named].tolist(), strict=True)
-        )
+    for _, targets in recorded:
+        named = targets.confirmed
+        number |= dict(zip(targets.initiation_number[named].tolist(), targets.number[named].tolist(), strict=True))
     names = sorted(set(number.values()))
     if not names:
         return None
     row_of = {name: row for row, name in enumerate(names)}
     scans, states = [], []
     chosen: dict[int, Targets] = {}
-    for state in recorded:
-        assert state.scan is not None
-        assert state.time_ns is not None
+    while recorded:
+        scan, targets = recorded.popleft()
         frames = []
-        for one in state.scan.frames:
+        for one in scan.frames:
             known = np.array([int(i) in number for i in one.ids.tolist()], dtype=np.bool_)
             ids = np.array([row_of[number[int(i)]] for i in one.ids[known].tolist()], dtype=np.int64)
             ids, at = np.unique(ids, return_index=True)
             statistics = last.statistics.get(one.frame.camera.name, one.statistics)
             statistics = replace(statistics, interval_s=one.statistics.interval_s)
-            noise = one.noise * (statistics.noise / one.statistics.noise)
-            frames.append(replace(one, ids=ids, column=one.column[known][at], statistics=statistics, noise=noise))
-        scans.append(RecordedScan(state.time_ns, tuple(frames)))
-        rows = [row_of[number[i]] if i in number else -1 for i in state.targets.initiation_number.tolist()]
+            noise = one.noise_entries * (statistics.noise / one.statistics.noise)
+            frames.append(
+                replace(one, ids=ids, column=one.column[known][at], statistics=statistics, noise_entries=noise)
+            )
+        scans.append(replace(scan, frames=tuple(frames)))
+        rows = [row_of[number[i]] if i in number else -1 for i in targets.initiation_number.tolist()]
         use = [i for i, row in enumerate(rows) if row >= 0 and row not in rows[:i]]
         order = sorted(use, key=lambda i: rows[i])
         for i in order:
-            chosen[rows[i]] = state.targets.select(np.array([i]))
+            chosen[rows[i]] = targets.select(np.array([i]))
         at = np.array(order, dtype=np.int64)
-        states.append(
-            (np.array([rows[i] for i in order], dtype=np.int64), state.targets.mean[at], state.targets.covariance[at])
-        )
+        states.append((np.array([rows[i] for i in order], dtype=np.int64), targets.mean[at], targets.covariance[at]))
     tracks = [chosen[row] for row in range(len(names))]
     together = tracks[0]
     for track in tracks[1:]:
@@ -208,17 +226,17 @@ def _sampled(
         wanted = times_ns[inside]
         if not len(wanted):
             continue
-        nearest = np.abs(at[None, :] - wanted[:, None]).argmin(axis=1)
+        nearest = _nearest(at, wanted)
         elapsed = (wanted - at[nearest]) / NANOSECONDS
         position = mean[nearest][:, POSITION] + elapsed[:, None] * mean[nearest][:, VELOCITY]
         size = np.exp(mean[nearest][:, LOG_SIZE])
         model = TARGET_MODELS[int(smoother.tracks.kind[row])]
         if up is not None and model.upright:
             position = position - 0.5 * size[:, None] * up
-        spread = covariance[nearest][:, POSITION, POSITION]
+        spread = covariance[nearest]
         across = np.trace(spread, axis1=1, axis2=2) - (0.0 if up is None else np.einsum("i,nij,j->n", up, spread, up))
         std = np.sqrt(across / (3.0 if up is None else 2.0))
-        unseen = np.abs(seen[None, :] - wanted[:, None]).min(axis=1)
+        unseen = np.abs(seen[_nearest(seen, wanted)] - wanted)
         out.append(
             (seen[0], model.kind, wanted / NANOSECONDS, position, std, size, unseen <= coasting_ns, detections[row])
         )
@@ -227,6 +245,13 @@ def _sampled(
         FollowedTrack(number, kind, times, position, std, size, confirmed, tuple(found))
         for number, (_, kind, times, position, std, size, confirmed, found) in enumerate(out, 1)
     )
+
+
+def _nearest(times: Ints, wanted: Ints) -> Ints:
+    """Indices (n,) of the times, which ascend, that are nearest to the wanted ones (n,)."""
+    after = np.searchsorted(times, wanted).clip(max=len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(times[after] - wanted) < np.abs(wanted - times[before]), after, before)
 
 
 def _absences(scans: list[SmoothedScan], count: int) -> list[list[tuple[int, int]]]:

@@ -58,6 +58,10 @@ _REACH, _DOUBT = 1.5, 2.0
 to: of the exchanges that are right in simulated halls nearly all are within both."""
 _REACH_S = 1.5
 """Associations further than this from a change are not tried again: what else is known of a track outweighs it."""
+_TRIANGLE = np.triu_indices(STATE_DIM)
+_ENTRY = np.zeros((STATE_DIM, STATE_DIM), dtype=np.int64)
+"""Of a covariance's entries, which of its upper triangle they are."""
+_ENTRY[_TRIANGLE] = _ENTRY.T[_TRIANGLE] = np.arange(len(_TRIANGLE[0]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,8 +74,8 @@ class RecordedScan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedScan:
-    """Tracks at the time of a scan. row: (k,) which. mean, covariance: (k, 7), (k, 7, 7), from past and future. hits:
-    (k,) detections in the scan. odds: (k,) what it adds to the log odds of existence."""
+    """Tracks at the time of a scan. row: (k,) which. mean: (k, 7), from past and future. covariance: (k, 3, 3) of the
+    positions. hits: (k,) detections in the scan. odds: (k,) what it adds to the log odds of existence."""
 
     now_ns: int
     row: Ints
@@ -81,23 +85,70 @@ class SmoothedScan:
     odds: Floats
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Filtered:
-    """States of the tracks ``row`` at a scan, before and after its own detections."""
+    """States of the tracks ``row`` (k,) at a scan, with its own detections. triangle: (k, 28) of the covariances."""
 
     row: Ints
-    predicted: Targets
     mean: Floats
-    covariance: Floats
+    triangle: Floats
+
+    def covariance(self, places: Ints) -> Floats:
+        """The covariances (m, 7, 7) of some of them."""
+        return self.triangle[places][:, _ENTRY]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ScanEvidence:
-    """What a scan's frames say of the tracks ``row`` (k,), each and in all."""
+    """What a scan's f frames say of the tracks ``row`` (k,).
+
+    column, odds, missed: (f, k + 1) as of `FrameEvidence`, the last of any other track. said: (d, 8, 7) information and
+    its vector of the associated detections, frame after frame; where nothing is associated they are zero.
+    """
 
     row: Ints
-    frames: tuple[FrameEvidence, ...]
-    total: FrameEvidence
+    column: Ints
+    odds: Floats
+    missed: Floats
+    said: Floats
+
+    @classmethod
+    def of(cls, row: Ints, frames: Sequence[FrameEvidence]) -> _ScanEvidence:
+        """From that of each frame."""
+        column = np.array([[*one.column.tolist(), -1] for one in frames])
+        odds, missed = (
+            np.array([[*getattr(one, name).tolist(), 0.0] for one in frames]) for name in ("odds", "missed")
+        )
+        said = [np.hstack([one.information, one.vector[:, None]])[one.column >= 0] for one in frames]
+        return cls(row, column, odds, missed, np.concatenate(said))
+
+    def frames(self, row: Ints) -> tuple[FrameEvidence, ...]:
+        """That of each frame, of the tracks ``row`` (m,); of others than these nothing is said."""
+        places = _places(self.row, row)
+        said, parts = self._dense()[places], (self.odds[:, places], self.missed[:, places], self.column[:, places])
+        return tuple(
+            FrameEvidence(said[:, frame, :STATE_DIM], said[:, frame, STATE_DIM], *each)
+            for frame, each in enumerate(zip(*parts, strict=True))
+        )
+
+    def total(self, row: Ints) -> tuple[Floats, Floats]:
+        """Information (m, 7, 7) and its vector (m, 7) of all frames together, of the tracks ``row`` (m,)."""
+        said = self._dense().sum(axis=1)[_places(self.row, row)]
+        return said[:, :STATE_DIM], said[:, STATE_DIM]
+
+    def _dense(self) -> Floats:
+        """Information and vector (k + 1, f, 8, 7) of each track in each frame."""
+        out = np.zeros((*self.column.T.shape, STATE_DIM + 1, STATE_DIM))
+        frame, place = np.nonzero(self.column >= 0)
+        out[place, frame] = self.said
+        return out
+
+    def without(self, row: Ints) -> _ScanEvidence:
+        """The same, but nothing of some tracks."""
+        gone = np.append(np.isin(self.row, row), False)
+        odds, missed = np.where(gone, 0.0, self.odds), np.where(gone, 0.0, self.missed)
+        kept = ~gone[np.nonzero(self.column >= 0)[1]]
+        return _ScanEvidence(self.row, np.where(gone, -1, self.column), odds, missed, self.said[kept])
 
 
 class BatchSmoother:
@@ -120,7 +171,7 @@ class BatchSmoother:
         for scan, (row, mean, covariance) in zip(self.scans, states, strict=True):
             there = replace(tracks.select(row), mean=mean, covariance=covariance)
             found = associate_jointly(scan.frames, there, scan.now_ns, there, parameters.up, self.colour_std, 0)
-            self.evidence.append(_ScanEvidence(row, found.evidence, found.total))
+            self.evidence.append(_ScanEvidence.of(row, found.evidence))
         self._changed = np.ones(len(self.scans), dtype=np.bool_)
         nowhere = np.full((len(tracks), 3), np.nan)
         self._rates = EntryExitRates.of(nowhere, nowhere, np.zeros((0, 3)), 1, parameters.scale.units_per_m)
@@ -141,16 +192,15 @@ class BatchSmoother:
         out: list[SmoothedScan] = []
         for number in range(iterations + 1):
             if number:
-                cut = self._cut(out)
-                forward, backward = self._filter(1), self._filter(-1)
-                self._rates = self._entry_exit_rates(forward, backward)
-                self._link(forward, backward, cut)
+                self._link(self._cut(out))
             forward, backward = self._filter(1), self._filter(-1)
             if 0 < number < iterations:
                 self._rates = self._entry_exit_rates(forward, backward)
                 if self._exchange(forward, backward, number):
+                    del forward, backward
                     forward, backward = self._filter(1), self._filter(-1)
             out = self._associate(forward, backward, relink=number < iterations)
+            del forward, backward
             if number >= _WIDTHS:
                 self._changed[:] = False
             if progress is not None:
@@ -173,82 +223,82 @@ class BatchSmoother:
         empty = first > last
         first, last = np.maximum(first - 1, 0), np.minimum(last + 1, len(self.scans) - 1)
         first[empty] = len(self.scans)
-        out: list[_Filtered | None] = [None] * len(self.scans)
+        out: list[_Filtered] = []
         up, units = self.parameters.up, self.parameters.scale.units_per_m
-        running = self.tracks.select(np.zeros(0, dtype=np.int64))
-        rows = np.zeros(0, dtype=np.int64)
-        previous_ns: int | None = None
         for index in range(len(self.scans))[::direction]:
-            scan = self.scans[index]
-            elapsed = 0.0 if previous_ns is None else (scan.now_ns - previous_ns) / NANOSECONDS
             alive = (first <= index) & (index <= last)
-            keep = alive[rows]
-            predicted = predict_targets(running.select(np.flatnonzero(keep)), elapsed, self.parameters)
-            predicted = on_floor(predicted, self.floor, abs(elapsed))
+            rows = out[-1].row[alive[out[-1].row]] if out else np.zeros(0, dtype=np.int64)
             alive[rows] = False
-            entering = np.flatnonzero(alive)
-            rows = np.concatenate([rows[keep], entering])
-            if len(entering):
-                births = prior_of_births(self.tracks.select(entering), self.floor, self.parameters)
-                predicted = predicted.concatenate(births)
-            said = self.evidence[index].total.of(_places(self.evidence[index].row, rows))
+            rows = np.concatenate([rows, np.flatnonzero(alive)])
+            predicted, elapsed = self._predicted(out[-1] if out else None, rows, index, direction)
+            said = self.evidence[index].total(rows)
             manoeuvre = manoeuvre_hypothesis(predicted, elapsed, units, up, posture=True)
-            widened = widened_by_evidence(predicted, manoeuvre, said.information, said.vector)
-            mean, covariance = self._updated(index, rows, predicted.mean, widened)
-            running = replace(predicted, mean=mean, covariance=covariance)
-            out[index] = _Filtered(rows, predicted, mean, covariance)
-            previous_ns = scan.now_ns
-        return [one for one in out if one is not None]
+            mean, covariance = _updated(predicted.mean, widened_by_evidence(predicted, manoeuvre, *said), *said)
+            out.append(_Filtered(rows, mean, covariance[:, *_TRIANGLE]))
+        return out[::direction]
 
-    def _updated(self, index: int, rows: Ints, mean: Floats, covariance: Floats) -> tuple[Floats, Floats]:
-        """States with the evidence of a scan."""
-        found = self.evidence[index].total.of(_places(self.evidence[index].row, rows))
-        prior = np.linalg.inv(covariance)
-        vector = (prior @ mean[:, :, None])[:, :, 0] + found.vector
-        inverse = np.linalg.inv(prior + found.information)
-        covariance = 0.5 * (inverse + inverse.transpose(0, 2, 1))
-        return (covariance @ vector[:, :, None])[:, :, 0], covariance
+    def _predicted(self, before: _Filtered | None, rows: Ints, index: int, direction: int) -> tuple[Targets, float]:
+        """The tracks ``rows`` at a scan from their states at the one before, and the time since [s].
+
+        Of those that have none there, the last ones, nothing is known.
+        """
+        places = _places(before.row, rows) if before is not None else np.full(len(rows), -1)
+        known = int((places >= 0).sum())
+        predicted, elapsed = self.tracks.select(rows[:known]), 0.0
+        if before is not None:
+            elapsed = (self.scans[index].now_ns - self.scans[index - direction].now_ns) / NANOSECONDS
+            there = places[:known]
+            predicted = replace(predicted, mean=before.mean[there], covariance=before.covariance(there))
+            predicted = predict_targets(predicted, elapsed, self.parameters)
+            predicted = on_floor(predicted, self.floor, abs(elapsed))
+        if known < len(rows):
+            births = prior_of_births(self.tracks.select(rows[known:]), self.floor, self.parameters)
+            predicted = predicted.concatenate(births)
+        return predicted, elapsed
 
     def _associate(self, forward: list[_Filtered], backward: list[_Filtered], relink: bool) -> list[SmoothedScan]:
         """Every scan associated again, given past and future."""
         first, last = self._extents()
         due, self._changed = self._near_changes(), np.zeros(len(self.scans), dtype=np.bool_)
-        times = np.array([scan.now_ns for scan in self.scans])
-        since = (np.diff(times, prepend=times[:1], append=times[-1:]) / NANOSECONDS).tolist()
         out = []
-        for index, (scan, past, future) in enumerate(zip(self.scans, forward, backward, strict=True)):
-            _, a, b = np.intersect1d(past.row, future.row, return_indices=True)
-            row = past.row[a]
+        for index, scan in enumerate(self.scans):
+            past, future, since = self._from_both_sides(forward, backward, index)
+            _, a, b = np.intersect1d(forward[index].row, backward[index].row, return_indices=True)
+            row, past = forward[index].row[a], past.select(a)
             mean, covariance = fused_predictions(
-                past.predicted.select(a),
-                future.predicted.select(b),
-                (since[index], since[index + 1]),
-                self.parameters.scale.units_per_m,
-                self.parameters.up,
+                past, future.select(b), since, self.parameters.scale.units_per_m, self.parameters.up
             )
             inside = (first[row] <= index) & (index <= last[row])
             prior = replace(
-                past.predicted.select(a), mean=mean, covariance=covariance,
+                past, mean=mean, covariance=covariance,
                 existence=np.where(inside, _INSIDE, _BESIDE), initiation_number=row,
             )  # fmt: skip
-            mean, covariance = self._updated(index, row, mean, covariance)
+            mean, covariance = _updated(mean, covariance, *self.evidence[index].total(row))
             there = replace(prior, mean=mean, covariance=covariance)
-            places = _places(self.evidence[index].row, row)
             found = associate_jointly(
                 scan.frames, there, scan.now_ns, prior, self.parameters.up, self.colour_std,
-                2 if relink and due[index] else 0,
-                tuple(one.of(places) for one in self.evidence[index].frames),
+                2 if relink and due[index] else 0, self.evidence[index].frames(row),
             )  # fmt: skip
             self._changed[index] = found.changed
             self.scans[index] = replace(scan, frames=found.frames)
-            self.evidence[index] = _ScanEvidence(row, found.evidence, found.total)
-            after = found.targets
-            out.append(SmoothedScan(scan.now_ns, row, after.mean, after.covariance, found.hits, found.total.odds))
+            self.evidence[index] = _ScanEvidence.of(row, found.evidence)
+            mean, spread = found.targets.mean, found.targets.covariance[:, POSITION, POSITION].copy()
+            odds = np.asarray(sum(self.evidence[index].odds))[:-1]
+            out.append(SmoothedScan(scan.now_ns, row, mean, spread, found.hits, odds))
         means = self.tracks.mean.copy()
         for one in reversed(out):
             means[one.row] = one.mean
         self.tracks = replace(self.tracks, mean=means)
         return out
+
+    def _from_both_sides(
+        self, forward: list[_Filtered], backward: list[_Filtered], index: int
+    ) -> tuple[Targets, Targets, tuple[float, float]]:
+        """The tracks of both lists at a scan, from the scans before and from those after it, and the times between."""
+        before, after = forward[index - 1] if index else None, (*backward[index + 1 : index + 2], None)[0]
+        past, since = self._predicted(before, forward[index].row, index, 1)
+        future, until = self._predicted(after, backward[index].row, index, -1)
+        return past, future, (since, -until)
 
     def _near_changes(self) -> Bools:
         """Which scans (n,) are within ``_REACH_S`` of one whose association or links have changed."""
@@ -300,7 +350,7 @@ class BatchSmoother:
             tracks = np.flatnonzero((first < index) & (after - 1 < last))
             if index >= untouched and len(tracks) > 1 and (due[index] or not judged):
                 if judged:
-                    follows = self._more_probable_futures(forward[index], backward[index], tracks, index)
+                    follows = self._more_probable_futures(forward, backward, tracks, index)
                 else:
                     ends = np.full(len(tracks), index - 1)
                     score = self._link_scores(forward, backward[after], tracks, tracks, ends, after - 1)
@@ -317,20 +367,22 @@ class BatchSmoother:
             label = new
         return untouched > 1
 
-    def _more_probable_futures(self, past: _Filtered, future: _Filtered, tracks: Ints, index: int) -> Ints:
+    def _more_probable_futures(
+        self, forward: list[_Filtered], backward: list[_Filtered], tracks: Ints, index: int
+    ) -> Ints:
         """Whose future (n,) each track gets, so that the detections of a scan and what is around it are most probable.
 
         Where two tracks are exchanged, each camera's detections of them in the scan are whose they then more probably
         are: judged by the past of the one and the future of the other, with and without a manoeuvre.
         """
         follows = np.arange(len(tracks))
-        before = past.predicted.select(_places(past.row, tracks))
-        after = future.predicted.select(_places(future.row, tracks))
+        past, future, since = self._from_both_sides(forward, backward, index)
+        before = past.select(_places(forward[index].row, tracks))
+        after = future.select(_places(backward[index].row, tracks))
         off = np.linalg.norm(before.mean[:, None, POSITION] - before.mean[None, :, POSITION], axis=2)
         near = (off < _REACH * np.exp(before.mean[:, LOG_SIZE])) & (before.kind[:, None] == before.kind)
         i, j = np.nonzero(np.triu(near, 1))
-        times = [scan.now_ns / NANOSECONDS for scan in self.scans[index - 1 : index + 2]]
-        how = (times[1] - times[0], times[2] - times[1]), self.parameters.scale.units_per_m, self.parameters.up
+        how = since, self.parameters.scale.units_per_m, self.parameters.up
         heads, tails = np.stack([i, j, i, j]), np.stack([i, j, j, i])  # rows: as they are, and exchanged
         fit, _, odds = continuation_hypotheses(before.select(heads.ravel()), after.select(tails.ravel()), *how)
         kept = np.array([1, 1, -1, -1]) @ log_mixture(odds, *fit).reshape(4, -1) < _DOUBT
@@ -342,8 +394,7 @@ class BatchSmoother:
         mean, covariance = fused_predictions(before.select(heads[2:].ravel()), after.select(tails[2:].ravel()), *how)
         missed, vector = np.zeros((4, m)), np.zeros((4, m, STATE_DIM))
         information = np.zeros((4, m, STATE_DIM, STATE_DIM))
-        places = _places(self.evidence[index].row, tracks)
-        for frame in [each.of(places) for each in self.evidence[index].frames]:
+        for frame in self.evidence[index].frames(tracks):
             keep, change = (
                 log_evidence(mean, covariance, frame.information[owner.ravel()], frame.vector[owner.ravel()])
                 + np.where(frame.column[owner] < 0, frame.missed[heads[2:]], 0.0).ravel()
@@ -368,15 +419,12 @@ class BatchSmoother:
 
     def _forget(self, index: int, rows: Ints) -> None:
         """Leave a scan's detections of some tracks to be associated anew."""
-        scan, found = self.scans[index], self.evidence[index]
+        scan = self.scans[index]
         frames = tuple(
             replace(one, ids=one.ids[kept := ~np.isin(one.ids, rows)], column=one.column[kept]) for one in scan.frames
         )
         self.scans[index] = replace(scan, frames=frames)
-        known = np.where(np.isin(found.row, rows), -1, np.arange(len(found.row)))
-        self.evidence[index] = _ScanEvidence(
-            found.row, tuple(one.of(known) for one in found.frames), found.total.of(known)
-        )
+        self.evidence[index] = self.evidence[index].without(rows)
         self._changed[index] = True
 
     def _rename(self, index: int, names: Ints) -> None:
@@ -391,18 +439,20 @@ class BatchSmoother:
         tracks = self.tracks.select(np.array(source, dtype=np.int64))
         self.tracks = replace(tracks, initiation_number=np.arange(len(source)))
 
-    def _link(self, forward: list[_Filtered], backward: list[_Filtered], before: dict[int, int]) -> None:
+    def _link(self, before: dict[int, int]) -> None:
         """The tracks' pasts assigned to the futures that continue them best, at every boundary of two scans.
 
         before: of tracks that were cut just now, what they were cut from: linked again, they have not changed.
         """
+        forward, backward = self._filter(1), self._filter(-1)
+        self._rates = self._entry_exit_rates(forward, backward)
         first, last = self._extents()
         n = len(self.tracks)
         label, count, source = np.arange(n), n, list(range(n))
         lost: list[tuple[int, int, int]] = []  # pasts without a future: track, scan of its last detection, label
         missed, cut = np.zeros(n), np.zeros(n, dtype=np.bool_)
         for index in range(len(self.scans)):
-            missed[self.evidence[index].row] = self.evidence[index].total.missed
+            missed[self.evidence[index].row] = np.asarray(sum(self.evidence[index].missed))[:-1]
             if index + 1 == len(self.scans):
                 self._rename(index, label)
                 break
@@ -465,14 +515,14 @@ class BatchSmoother:
         mean, covariance = past.mean.copy(), past.covariance.copy()
         for at in np.unique(ends).tolist():
             rows = _places(forward[at].row, heads[chosen := ends == at])
-            mean[chosen], covariance[chosen] = forward[at].mean[rows], forward[at].covariance[rows]
+            mean[chosen], covariance[chosen] = forward[at].mean[rows], forward[at].covariance(rows)
         ended = np.array([self.scans[at].now_ns for at in ends.tolist()], dtype=np.int64)
         gap, ahead = (self.scans[index].now_ns - ended) / NANOSECONDS, (scan.now_ns - ended) / NANOSECONDS
         seen = mean[:, POSITION]
         past = predict_targets(replace(past, mean=mean, covariance=covariance), ahead, self.parameters)
         past = on_floor(past, self.floor, ahead)
         rows = _places(after.row, tails)
-        future = replace(self.tracks.select(tails), mean=after.mean[rows], covariance=after.covariance[rows])
+        future = replace(self.tracks.select(tails), mean=after.mean[rows], covariance=after.covariance(rows))
         typical = float(np.median(self.tracks.mean[:, LOG_SIZE]))
         units = self.parameters.scale.units_per_m
         manoeuvre = manoeuvre_hypothesis(past, ahead, units, self.parameters.up, posture=True)
@@ -484,3 +534,12 @@ def _places(rows: Ints, wanted: Ints) -> Ints:
     """Where each of ``wanted`` is in ``rows``, -1 = nowhere."""
     place = {track: at for at, track in enumerate(rows.tolist())}
     return np.array([place.get(track, -1) for track in wanted.tolist()], dtype=np.int64)
+
+
+def _updated(mean: Floats, covariance: Floats, information: Floats, vector: Floats) -> tuple[Floats, Floats]:
+    """States with the evidence of a scan."""
+    prior = np.linalg.inv(covariance)
+    vector = (prior @ mean[:, :, None])[:, :, 0] + vector
+    inverse = np.linalg.inv(prior + information)
+    covariance = 0.5 * (inverse + inverse.transpose(0, 2, 1))
+    return (covariance @ vector[:, :, None])[:, :, 0], covariance

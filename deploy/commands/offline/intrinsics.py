@@ -77,7 +77,7 @@ def intrinsics(
         raise InputError("--model and --field-of-view each give the field of view", remedy="keep one")
     from edge.detectors.board.description import Board, check_board
     from edge.devices.playback.video_reader import VideoReader
-    from edge.lens.board import BoardView, board_views
+    from edge.lens.board import MIN_CORNERS, BoardView, board_views
     from edge.lens.models import FIELD_OF_VIEW_STD, find_lens_model, horizontal_field_of_view
     from edge.lens.solve import MIN_VIEWS, LensCalibration, calibrate_lens, coverage_map, intrinsics_from_field_of_view
     from protocols.core.files import write_atomically
@@ -86,7 +86,7 @@ def intrinsics(
     known = None if model is None else find_lens_model(model)
     reader = VideoReader(video)
     fit: LensCalibration | None = None
-    guess_std = 0.0
+    guess_std, unused = 0.0, ""
     if known is not None:
         lens = intrinsics_from_field_of_view(
             reader.info.size, horizontal_field_of_view(known, reader.info.size), known.fisheye
@@ -105,10 +105,15 @@ def intrinsics(
             for view in board_views(described, reader, step, reader.info.size[0]):
                 views.append(view)
                 progress(f"{len(views)} views, frame {view.frame}", min(view.frame / total, 1.0) if total else 0.0)
+        if video.is_dir() and len(views) < total:
+            unused = (
+                f"{total - len(views)} of {total} photographs are not used: no board, fewer than {MIN_CORNERS} of its "
+                "corners, or the board where it was before"
+            )
         try:
             fit = calibrate_lens(views, reader.info.size, fisheye)
         except Refused as refusal:
-            refusal.reason = "; ".join((refusal.reason, *reader.warnings))
+            refusal.reason = "; ".join((refusal.reason, *reader.warnings, *filter(None, [unused])))
             raise
         lens = fit.intrinsics
         if fit.views < MIN_VIEWS:
@@ -145,7 +150,8 @@ def intrinsics(
             lines.append(f"the board is {shape}, which was allowed for")
         covered = f"corners in each part of the image ({100 * fit.coverage:.0f} %):"
         lines += [f"corners fit to {fit.rms_px:.3f} px; {covered}", *coverage_map(fit.cells)]
-    return answer(document | {"warnings": reader.warnings}, [*lines, *closing_lines(reader.warnings, [out])], json)
+    warnings = [*reader.warnings, *filter(None, [unused])]
+    return answer(document | {"warnings": warnings}, [*lines, *closing_lines(warnings, [out])], json)
 
 
 def _completed(file: Path, name: str, table: dict[str, Any]) -> str:

@@ -250,11 +250,10 @@ def _nowhere(bodies: _Bodies, cameras: Sequence[CameraCalibration], height: floa
     known = distance * (_LENGTH_STD + _BREADTH * np.abs(steepness)) < _MAX_ERROR
     for index, camera in enumerate(cameras):
         mine = bodies.owner == index
-        own = bodies.time[mine]
-        near = np.abs(bodies.time[:, None] - own).min(axis=1, initial=np.inf) <= _SAME_TIME_NS
+        off, _ = cKDTree(np.unique(bodies.time[mine])[:, None]).query(bodies.time[:, None], p=1)
         pixel = camera.intrinsics.project(camera.pose.camera_from_world(place))
         inside = ((pixel > 0.0) & (pixel < [camera.intrinsics.width, camera.intrinsics.height])).all(axis=1)
-        looked_at |= inside & near & ~mine
+        looked_at |= inside & (off <= _SAME_TIME_NS) & ~mine
     everybody = int((looked_at & (distance * _LENGTH_STD < _MAX_ERROR)).sum())
     looked_at &= known
     count, met = int(looked_at.sum()), int((_met(bodies, height) & looked_at).sum())

@@ -37,7 +37,7 @@ from hub.tracking.filter.detection_model import (
 )
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM
 from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis, log_evidence, log_mixture, widened_by_evidence
-from hub.tracking.filter.measurement import PredictedMeasurement, predict_measurement
+from hub.tracking.filter.measurement import PredictedMeasurement, noise_of, predict_measurement
 from hub.tracking.filter.target_states import ScanFrame, Targets
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Floats, Ints
@@ -259,7 +259,8 @@ def _evidence(
     information, vector = np.zeros((n, STATE_DIM, STATE_DIM)), np.zeros((n, STATE_DIM))
     column, detected = np.full(n, -1), np.zeros(n)
     if len(one.frame):
-        scores = association_scores(one.frame, one.value, one.noise, there, predicted, ("",) * n, colour_std, fixed)
+        noise = noise_of(one.noise_entries)
+        scores = association_scores(one.frame, one.value, noise, there, predicted, ("",) * n, colour_std, fixed)
         expected = there.existence * probability
         clutter_rate = false_detections(one.statistics, there.kind)
         log_ratio = scores.log_ratio + np.log(expected / ((1.0 - expected) * clutter_rate))[:, None]
@@ -274,7 +275,15 @@ def _evidence(
         if len(rows):
             sure = marginal[rows, column[rows]]
             information[rows], vector[rows] = _linearised(
-                one, there, predicted, scores.distance, rows, column[rows], sure, step
+                one.value[column[rows]],
+                noise[column[rows]],
+                there,
+                predicted,
+                scores.distance,
+                rows,
+                column[rows],
+                sure,
+                step,
             )
     fraction = independent_fraction(one.statistics.interval_s)
     odds = log_odds(posterior_existence(there.existence, probability, detected, fraction)) - log_odds(there.existence)
@@ -282,7 +291,8 @@ def _evidence(
 
 
 def _linearised(
-    one: ScanFrame,
+    value: Floats,
+    noise: Floats,
     there: Targets,
     predicted: PredictedMeasurement,
     distance: Floats,
@@ -291,11 +301,11 @@ def _linearised(
     sure: Floats,
     step: Floats,
 ) -> tuple[Floats, Floats]:
-    """Information of pairs and its vector, of the state at the scan's time."""
+    """Information of pairs and its vector, of the state at the scan's time. value, noise: the measurements."""
     selected = predicted.select(rows)
-    used = gated_rows(one.value[columns], selected, distance[rows, columns], there.covariance[rows])
-    innovation = np.where(used, one.value[columns] - selected.value, 0.0)
-    total = matched_noise(one.noise[columns], selected, distance[rows, columns], sure)
+    used = gated_rows(value, selected, distance[rows, columns], there.covariance[rows])
+    innovation = np.where(used, value - selected.value, 0.0)
+    total = matched_noise(noise, selected, distance[rows, columns], sure)
     innovation, jacobian, total = kalman.mask_rows(innovation, selected.jacobian, total, used)
     jacobian = jacobian @ step
     weighted = np.linalg.solve(total, jacobian).transpose(0, 2, 1)

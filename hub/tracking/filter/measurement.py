@@ -17,6 +17,8 @@ from protocols.geometry.types import Bools, Floats, Ints
 
 MEASUREMENT_DIM = 7  # three points and a size
 POINT, HEAD, FOOT, LOG_IMAGE_SIZE = slice(0, 2), slice(2, 4), slice(4, 6), 6
+NOISE_ENTRIES = np.array([0, 0, 1, 1, 2, 3, 4, 5]), np.array([0, 1, 0, 1, 2, 3, 4, 5])
+"""Rows and columns of a measured noise that are not zero: the point's covariance, and variances of head and foot."""
 BLOCKS = (POINT, HEAD, FOOT, slice(LOG_IMAGE_SIZE, MEASUREMENT_DIM))
 _LOG_SIZE_STD = 0.08
 """Of the measured log image size: silhouette sizes fluctuate."""
@@ -152,3 +154,10 @@ def measurements_of(frame: FrameDetections, detection: Ints) -> tuple[Floats, Fl
     for row in range(2, 6):
         noise[:, row, row] = 2.0 * pixel2
     return value, noise
+
+
+def noise_of(entries: Floats) -> Floats:
+    """The noise (m, 7, 7) of measurements with these of its entries (m, 8)."""
+    noise = np.zeros((len(entries), MEASUREMENT_DIM, MEASUREMENT_DIM))
+    noise[:, *NOISE_ENTRIES] = entries
+    return noise

@@ -99,12 +99,13 @@ class DetectionStatistics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanFrame:
-    """A frame of the scan. value, noise: its measurements. ids: (k,) initiation numbers of the targets, column: (k,)
-    their detections. ambiguous: whether another association was nearly as probable."""
+    """A frame of the scan. value: (n, 7) its measurements. noise_entries: (n, 8) of their noise that are not zero. ids:
+    (k,) initiation numbers of the targets, column: (k,) their detections. ambiguous: whether another association was
+    nearly as probable."""
 
     frame: FrameDetections
     value: Floats
-    noise: Floats
+    noise_entries: Floats
     statistics: DetectionStatistics
     ids: Ints
     column: Ints

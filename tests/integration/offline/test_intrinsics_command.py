@@ -107,12 +107,14 @@ def test_a_board_only_at_the_image_centre_is_refused(tmp_path: Path, capsys: Cap
 
 def test_a_few_views_give_a_lens_with_its_std(tmp_path: Path, capsys: Capture) -> None:
     video = render_board(tmp_path / "some", "charuco", False, count=5)
+    cv2.imwrite(str(video / "empty.bmp"), np.full_like(cv2.imread(str(video / "000.bmp")), 128))
     assert run(command(video, tmp_path / "rig.toml", "charuco")) == 0
     report = json.loads(capsys.readouterr().out)
     table = tomllib.loads((tmp_path / "rig.toml").read_text())["some"]
     assert 0.005 < table["focal_std"] < 0.05
     assert abs(table["matrix"][0][0] / PINHOLE.focal - 1) < 3 * table["focal_std"]
     assert report["views"] == 5
+    assert report["warnings"][0].startswith("1 of 6 photographs are not used: no board, ")
 
 
 def test_an_inverted_board_is_found_without_a_setting(tmp_path: Path, capsys: Capture) -> None:
@@ -126,7 +128,7 @@ def test_an_inverted_board_is_found_without_a_setting(tmp_path: Path, capsys: Ca
 def test_few_views_or_none_are_refused(tmp_path: Path, capsys: Capture) -> None:
     video = render_board(tmp_path / "few", "charuco", False, count=2)
     assert run(command(video, tmp_path / "rig.toml", "charuco")) == 3
-    assert "2 different views" in capsys.readouterr().err
+    assert "2 different views, 3 give an approximate lens, 8 a good one" in capsys.readouterr().err
     assert run([*command(video, tmp_path / "rig.toml", "charuco"), "--dictionary", "6X6_50"]) == 3
     assert "in no frame" in capsys.readouterr().err
 

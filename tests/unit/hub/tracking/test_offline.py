@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -132,6 +133,21 @@ def test_a_crowd_at_two_frames_a_second(lag_s: float, turn: float) -> None:
     assert 1.55 < np.median([np.median(track.height) for track in result.tracks]) < 1.9
 
 
+@pytest.mark.parametrize(("count", "most"), [(FRAMES, 3_000_000), (20_000, 20_000_000)])
+def test_memory_for_frames_and_for_wanted_times(count: int, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """2 kB a person and frame, where states and evidence took 4; and no table of all times by all detections, which
+    took 16 GB for who is seen for an hour."""
+    messages, calibration, _ = crowd(3, 0.0, 0.0)
+    monkeypatch.setattr(offline.BatchSmoother.run, "__defaults__", (2, None))
+    times = np.linspace(0.0, FRAMES / FPS * NANOSECONDS, count).astype(np.int64).tolist()
+    tracemalloc.start()
+    try:
+        follow(messages, calibration, times, up=UP)
+        assert tracemalloc.get_traced_memory()[1] < most
+    finally:
+        tracemalloc.stop()
+
+
 def test_who_sits_down_and_stands_up_keeps_the_number() -> None:
     """People who sat down were no longer what their track predicted, and began another one; so they did on rising."""
     messages, calibration, truth = crowd(3, 0.0, 0.0, low=0.72)
@@ -246,8 +262,8 @@ def test_a_track_that_takes_over_somebody_else_is_cut_once(seed: int, monkeypatc
     messages, calibration = boxes(rng, place, cameras=4, height=3.0, tall=np.tile([1.55, 1.95], 3))
     smoother_of = offline._smoother
 
-    def taken_over(recorded: list[MultiTargetState], parameters: TrackerParameters) -> BatchSmoother | None:
-        smoother = smoother_of(recorded, parameters)
+    def taken_over(*given: Any) -> BatchSmoother | None:
+        smoother = smoother_of(*given)
         assert smoother is not None
         first, last = smoother._extents()
         names = np.arange(len(first))
@@ -306,7 +322,7 @@ def test_two_neighbours_get_the_futures_that_their_detections_support(
         smoother._rename(index, np.array([1, 0]))
     forward, backward = smoother._filter(1), smoother._filter(-1)
     for index in range(3, 9):
-        follows = smoother._more_probable_futures(forward[index], backward[index], np.arange(2), index)
+        follows = smoother._more_probable_futures(forward, backward, np.arange(2), index)
         # Before the exchange too: the detections of that scan are divided anew between the two.
         near = exchanged_at is not None and index in (exchanged_at - 1, exchanged_at)
         assert follows.tolist() == ([1, 0] if near else [0, 1])
