@@ -11,6 +11,7 @@ import pytest
 
 from deploy.agents.answer_store import HISTORY, LAST, AnswerStore
 from hub.live.live_hub import LiveHub, LiveSettings
+from hub.live.solver import SolverJob
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
@@ -83,6 +84,40 @@ def test_a_killed_hub_tracks_again_within_seconds(session: Session, kept: Path) 
     assert hub.calibration is not None
     for name, camera in hub.calibration.cameras.items():
         assert abs(session.clock_error(name, hub.calibration.reference, camera.time_map)) < 1e-3
+
+
+@pytest.mark.parametrize("change", ["gone", "restarted"])
+def test_without_one_of_its_cameras_the_others_verify_it(session: Session, kept: Path, change: str) -> None:
+    """Behind a link that is cut, nothing is heard of a camera; a restarted one has another clock."""
+    hub = restarted(kept)
+    reloaded = hub._reloaded
+    assert reloaded is not None
+    if change == "gone":
+        camera = reloaded.calibration.cameras["cam1"]
+        cameras = {**reloaded.calibration.cameras, "gone": camera}
+        reloaded.calibration = dataclasses.replace(reloaded.calibration, cameras=cameras)
+    else:
+        reloaded.boots = {**reloaded.boots, "cam1": "before"}
+    play(hub, session, 18.0, 22.0)
+    assert (hub.counters["solver_failures"], hub.counters["verified"]) == (0, 1)
+    assert hub.state(22.0)[0] == "calibrated"
+    assert hub.calibration is not None
+    assert set(hub.calibration.cameras) == ({"cam0", "cam1", "cam2"} if change == "gone" else {"cam0", "cam2"})
+
+
+def test_where_the_solver_fails_a_reloaded_answer_is_dropped_in_time(
+    session: Session, kept: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub = restarted(kept)
+
+    def fail(job: SolverJob) -> None:
+        raise KeyError(job.number)
+
+    monkeypatch.setattr("hub.live.solver._verified", fail)
+    play(hub, session, 4.0, 24.0)
+    assert hub.counters["solver_failures"] > 0
+    assert not hub.unverified
+    assert hub.calibration is not None, "an answer of its own"
 
 
 def test_a_camera_that_was_moved_meanwhile_is_not_believed(session: Session, kept: Path) -> None:
