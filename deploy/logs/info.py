@@ -11,7 +11,7 @@ from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import printable
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
-from protocols.topics import OBSERVATION
+from protocols.topics import OBSERVATION, STATUS
 
 _SHOWN = 100
 """Rows of a table; a file may hold 65,000 keys."""
@@ -39,7 +39,8 @@ class TopicDescription:
 
 @dataclass(frozen=True, slots=True)
 class CameraDescription:
-    """One boot of one camera. missing: observations absent from the log, according to the sequence numbers."""
+    """One boot of one camera. missing: observations absent from the log, according to the sequence numbers and to how
+    many the camera's own statuses in the log say that it had published."""
 
     camera: str
     boot_id: str
@@ -81,6 +82,11 @@ class _Boot:
     first: int = 2**64
     last: int = -1
 
+    def note(self, sequence: int) -> None:
+        """An observation of this number was published."""
+        self.first = min(self.first, sequence)
+        self.last = max(self.last, sequence)
+
     def missing(self) -> int:
         return max(0, self.last - self.first + 1 - self.observations)
 
@@ -90,14 +96,17 @@ def describe_log(path: Path | str) -> LogDescription:
     reader = LogReader(path)
     summary = reader.summary()
     boots: dict[tuple[str, str], _Boot] = {}
-    for logged in reader.messages([OBSERVATION]):
+    for logged in reader.messages([OBSERVATION, STATUS]):
         message = logged.message
-        assert isinstance(message, pb.Observation)
-        boot = boots.setdefault((message.camera, message.boot_id), _Boot())
-        boot.observations += 1
-        boot.detections += len(message.detections)
-        boot.first = min(boot.first, message.sequence)
-        boot.last = max(boot.last, message.sequence)
+        if isinstance(message, pb.Observation):
+            boot = boots.setdefault((message.camera, message.boot_id), _Boot())
+            boot.observations += 1
+            boot.detections += len(message.detections)
+            boot.note(message.sequence)
+        elif isinstance(message, pb.AgentStatus) and message.role == "camera":
+            numbered = round(message.counters["published"] + message.counters["unpublished"])
+            if numbered:
+                boots.setdefault((message.agent, message.boot_id), _Boot()).note(numbered - 1)
     rejected = dict(reader.counters)
     return LogDescription(
         path=str(path),

@@ -482,7 +482,7 @@ class LiveHub:
             self._jobs + 1,
             rig,
             observations,
-            last if self._reloaded is None else self._reloaded.calibration,
+            last if self._reloaded is None else self._reloaded.on_clocks(boots),
             search,
             full,
             self._reloaded is not None,
@@ -554,6 +554,8 @@ class LiveHub:
         self.solver_failure = answer.reason if answer.failed else ""
         if answer.failed:
             self.counters["solver_failures"] += 1
+            if job.verify and (self._reloaded is None or self._reloaded.has_failed(now)):
+                self._reloaded, self.calibration = None, None  # searched from scratch, whatever the solver stumbles at
             self._schedule.suspect(job, () if self.calibration is None else self.calibration.cameras, now)
             return [solver_event(job, "failed", [], answer)]
         self._schedule.clear_suspects()

@@ -69,6 +69,13 @@ class ReloadedCalibration:
         self.since = now
         return replace(self.calibration, cameras=kept)
 
+    def on_clocks(self, boots: Mapping[str, str]) -> Calibration:
+        """The cameras that rows can verify. boots: of the rows' cameras, which need not be all that it has."""
+        cameras = self.calibration.cameras
+        if self.arrival is None:
+            cameras = {name: one for name, one in cameras.items() if self.boots.get(name) == boots.get(name)}
+        return replace(self.calibration, cameras={name: one for name, one in cameras.items() if name in boots})
+
     def has_failed(self, now: float) -> bool:
         """Whether new rows did not verify it in time."""
         return self.since is None or now - self.since > _VERIFY_S

@@ -10,6 +10,7 @@ from google.protobuf.message import Message
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.clocks.observation_stream import without_tracked
 from hub.live.live_hub import LiveHub, merge_rigs
+from hub.live.reloaded import ReloadedCalibration
 from hub.live.solver import SolverJob
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.builder import SessionBuilder
@@ -63,6 +64,10 @@ class ScheduledHub(LiveHub):
         )
         rig, observations = self._whole.build()
         last = self._start_from(boots)
+        if not event.verify or last is None:
+            self._reloaded = None
+        elif self._reloaded is None:  # what the hub reloaded after a restart is this one's own last answer
+            self._reloaded = ReloadedCalibration(last, boots, {}, None, since=now)
         job = SolverJob(
             event.job,
             merge_rigs(rig, self._rig),
@@ -70,7 +75,7 @@ class ScheduledHub(LiveHub):
             last,
             event.search,
             event.full,
-            False,
+            self._reloaded is not None,
             _priors(event.clock_priors, boots),
             _priors(event.arrivals, boots),
             event.refine_lenses,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 import threading
 import time
@@ -72,6 +73,24 @@ def test_a_partition_of_a_minute_loses_nothing(ends: Ends) -> None:
     )
     assert sequences == list(range(put))
     assert answer["counters"]["lost"] == 0
+
+
+def test_links_that_are_cut_at_once_hold_up_no_other(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        near, far, link = stack.enter_context(bad_link(tmp_path))
+        stack.enter_context(router(tmp_path, ENDPOINT, far))
+        receiving = stack.enter_context(receiver(ENDPOINT, namespace=far))
+        receiving.ready()
+        for camera, side in (("cam0", far), *((f"cam{index}", near) for index in range(1, 5))):
+            assert stack.enter_context(publisher(ENDPOINT, camera, namespace=side)).ready()["ready"]
+        time.sleep(2.0)
+        link.set(partition=1)
+        time.sleep(6.0)
+        arrivals = max(receiving.ask()["arrivals"].values(), key=len)  # of cam0, whose link holds
+    pause_s = max(later - earlier for earlier, later in itertools.pairwise([*arrivals, time.monotonic()]))
+    restarts = (tmp_path / "router.txt").read_text(encoding="utf-8").count("starting anew")
+    measured("four links cut at once", "no pause of a fifth", f"{pause_s:.2f} s, {restarts} restarts", pause_s <= 0.5)
+    assert restarts == 0
 
 
 @pytest.mark.parametrize("ends", [4.0], indirect=True)

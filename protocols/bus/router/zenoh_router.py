@@ -7,11 +7,14 @@ receives it through a wildcard subscription.
 
 from __future__ import annotations
 
+import os
 import socket
+import stat
+import struct
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
@@ -90,8 +93,9 @@ def run_router(
     canary = Canary(inside, f"syncline/{site}/canary/{key_segment(agent)}")
     with open_bus(site, inside, timeout_s=5.0) as bus, bus.announce(ROLE, agent, boot):
         publisher = bus.publisher(STATUS, agent)
-        passing, next_status = False, 0.0
+        passing, next_status, sockets = False, 0.0, set[int]()
         while not stop.wait(_TICK_S):
+            sockets = close_without_waiting(sockets)
             silent = canary.silent_s()
             if silent > DEAD_AFTER_S:
                 died(f"nothing has passed through this router for {silent:.1f} s, although it is alive")
@@ -116,6 +120,24 @@ def run_router(
     router.close()
     if not stop.is_set():
         raise RulesChanged
+
+
+def close_without_waiting(done: Set[int]) -> set[int]:
+    """Have no open socket of this process wait, when it is closed, for what it could not send; on Linux.
+
+    Zenoh 1.10.2 sets SO_LINGER to 10 s, so that of a link that is cut, or given up while it is made, the close holds up
+    one of its few threads, and with it, often, all links of the router. done: inodes, as the last call returned them.
+    """
+    sockets = set[int]()
+    with suppress(OSError):
+        for file in os.scandir("/proc/self/fd"):
+            with suppress(OSError):
+                status = os.fstat(int(file.name))
+                if stat.S_ISSOCK(status.st_mode) and status.st_ino not in done:
+                    with socket.socket(fileno=os.dup(int(file.name))) as one:
+                        one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
+                sockets.add(status.st_ino)
+    return sockets
 
 
 def _changed(file: Path | None) -> int:

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from google.protobuf.message import Message
 
 from deploy.agents.answer_store import HISTORY, LAST, AnswerStore
 from hub.live.live_hub import LiveHub, LiveSettings
+from hub.live.scheduled_hub import ScheduledHub
+from hub.live.solver import SolverJob
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
@@ -26,8 +29,11 @@ def session() -> Session:
     return simulate(71, 3, 24)
 
 
-def play(hub: LiveHub, session: Session, begin: float, end: float, clock: float = 1e9) -> list[pb.Calibration]:
-    """Play a part of the session at its true times; ``clock``: of the hub when the session began."""
+def play(
+    hub: LiveHub, session: Session, begin: float, end: float, clock: float = 1e9, log: list[Message] | None = None
+) -> list[pb.Calibration]:
+    """Play a part of the session at its true times; ``clock``: of the hub when the session began; log: of it."""
+    kept = [] if log is None else log
     stream = []
     for message in messages(session):
         if isinstance(message, pb.Observation):
@@ -35,11 +41,14 @@ def play(hub: LiveHub, session: Session, begin: float, end: float, clock: float 
             stream.append((true, message))
         else:
             hub.handle(message, clock + begin)
+            kept.append(message)
     out = []
     for true, message in sorted(stream, key=lambda item: item[0]):
         if begin <= true < end:
             hub.handle(message, clock + true + 0.05)
-            out += [one for one in hub.tick(true) if isinstance(one, pb.Calibration)]
+            published = hub.tick(true)
+            kept += [message, *(one for one in published if isinstance(one, pb.SolverEvent))]
+            out += [one for one in published if isinstance(one, pb.Calibration)]
     return out
 
 
@@ -83,6 +92,58 @@ def test_a_killed_hub_tracks_again_within_seconds(session: Session, kept: Path) 
     assert hub.calibration is not None
     for name, camera in hub.calibration.cameras.items():
         assert abs(session.clock_error(name, hub.calibration.reference, camera.time_map)) < 1e-3
+
+
+def maps(message: pb.Calibration) -> list[float]:
+    """Clocks and positions; the file of a reloaded answer keeps their last bits but one."""
+    return [value for one in message.cameras for value in (one.time_offset, one.clock_rate, *one.translation)]
+
+
+def test_a_replay_of_the_log_verifies_the_reloaded_answer_too(session: Session, kept: Path) -> None:
+    log: list[Message] = []
+    play(LiveHub(SETTINGS), session, 0.0, 18.0, log=log)
+    hub = restarted(kept)
+    verified = [one for one in play(hub, session, 18.0, 22.0, log=log) if one.state == "calibrated"]
+    replayed, out = ScheduledHub(), []
+    for message in log:
+        replayed.handle(message)
+        out += [one for one in replayed.tick(0.0) if isinstance(one, pb.Calibration)]
+    assert replayed.counters["verified"] == hub.counters["verified"] == 1
+    assert [maps(one) for one in out[-len(verified) :]] == [pytest.approx(maps(one), rel=1e-12) for one in verified]
+
+
+@pytest.mark.parametrize("change", ["gone", "restarted"])
+def test_without_one_of_its_cameras_the_others_verify_it(session: Session, kept: Path, change: str) -> None:
+    """Behind a link that is cut, nothing is heard of a camera; a restarted one has another clock."""
+    hub = restarted(kept)
+    reloaded = hub._reloaded
+    assert reloaded is not None
+    if change == "gone":
+        camera = reloaded.calibration.cameras["cam1"]
+        cameras = {**reloaded.calibration.cameras, "gone": camera}
+        reloaded.calibration = dataclasses.replace(reloaded.calibration, cameras=cameras)
+    else:
+        reloaded.boots = {**reloaded.boots, "cam1": "before"}
+    play(hub, session, 18.0, 22.0)
+    assert (hub.counters["solver_failures"], hub.counters["verified"]) == (0, 1)
+    assert hub.state(22.0)[0] == "calibrated"
+    assert hub.calibration is not None
+    assert set(hub.calibration.cameras) == ({"cam0", "cam1", "cam2"} if change == "gone" else {"cam0", "cam2"})
+
+
+def test_where_the_solver_fails_a_reloaded_answer_is_dropped_in_time(
+    session: Session, kept: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub = restarted(kept)
+
+    def fail(job: SolverJob) -> None:
+        raise KeyError(job.number)
+
+    monkeypatch.setattr("hub.live.solver._verified", fail)
+    play(hub, session, 4.0, 24.0)
+    assert hub.counters["solver_failures"] > 0
+    assert not hub.unverified
+    assert hub.calibration is not None, "an answer of its own"
 
 
 def test_a_camera_that_was_moved_meanwhile_is_not_believed(session: Session, kept: Path) -> None:

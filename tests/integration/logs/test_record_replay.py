@@ -21,7 +21,7 @@ from deploy.agents.recorder import RecorderResult, log_path, run_recorder
 from deploy.config.agents import RecorderConfig
 from deploy.logs.info import as_table, describe_log
 from deploy.logs.replay import replay
-from protocols.bus.base import AgentEvent, Bus, Received
+from protocols.bus.base import AgentEvent, Bus, Received, agent_status
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
@@ -283,6 +283,27 @@ def test_a_log_is_described_with_what_is_missing(tmp_path: Path) -> None:
     assert (description.duration_s, description.messages, description.damage) == (5.0, 8, "")
     assert description.metadata == {"syncline": {"seed": "7"}}
     assert [(item.name, item.bytes) for item in description.attachments] == [("rig.toml", 5)]
+
+
+def test_what_a_camera_says_that_it_published_is_missing_too(tmp_path: Path) -> None:
+    """As where a link was cut until the recording ended: no later number shows that anything is missing."""
+    path = tmp_path / "a.mcap"
+    with LogWriter(path, {}) as log:
+        for index in range(4):
+            log.write(OBSERVATION, "cam0", "local", observation("cam0", index, "boot-1"), index * SECOND)
+        for camera, published in (
+            ("cam0", 3),
+            ("cam0", 9),
+            ("cam1", 5),
+            ("cam1", 8),
+        ):
+            counters = {"published": published, "unpublished": 1}
+            status = agent_status("camera", camera, "boot-1", 0, "running", "", counters)
+            log.write(STATUS, camera, "local", status, published * SECOND)
+        hub = agent_status("hub", "hub", "h", 0, "running", "", {"published": 7})
+        log.write(STATUS, "hub", "local", hub, 9 * SECOND)
+    missing = [(camera.camera, camera.observations, camera.missing) for camera in describe_log(path).cameras]
+    assert missing == [("cam0", 4, 6), ("cam1", 0, 4)]
 
 
 def test_the_table_shows_damage_and_counts(tmp_path: Path) -> None:
