@@ -21,6 +21,7 @@ _FLOW_GRID = 7  # points a side
 _FLOW_MARGIN = 1.5  # of the resampled region, over the box
 _MIN_POINTS = 8  # of 49: of fewer, two wrong ones change the sides
 _FLOW_PRIOR = 8.0  # points whose weight holds the size where the flow is weak
+_INDEPENDENT = 4.0  # px of the image that tell one motion: 2 x 2 of a colour sensor
 _MAX_STEP = 1.12  # change of a side in one frame
 _MAX_TURN = 0.15  # in one frame [rad]
 
@@ -81,12 +82,13 @@ class BoxFlow:
         if near.sum() < _MIN_POINTS:
             return none
         p, q = p[near], q[near]
-        wider, skew = _slope(p, q[:, 0], 0)
-        higher, skew_y = _slope(p, q[:, 1], 1)
+        prior = _FLOW_PRIOR * max(_FLOW_GRID**2 * _INDEPENDENT / (box.width * box.height), 1.0)
+        wider, skew = _slope(p, q[:, 0], 0, prior)
+        higher, skew_y = _slope(p, q[:, 1], 1, prior)
         return wider, higher, 0.5 * (skew_y - skew)
 
 
-def _slope(old: Floats, new: Floats, axis: int) -> tuple[float, float]:
+def _slope(old: Floats, new: Floats, axis: int, prior: float) -> tuple[float, float]:
     """Robust derivatives of one new coordinate by the same and by the other old one, with a prior of 1 and 0."""
     spread = old.var(axis=0)
     step: Floats = np.zeros(2)
@@ -98,7 +100,7 @@ def _slope(old: Floats, new: Floats, axis: int) -> tuple[float, float]:
         scale = max(middle(np.abs(residual)), 0.1)
         weight = np.asarray(1.0 / (1.0 + np.square(residual / (2.0 * scale))), np.float64)
         centred = old - weight @ old / weight.sum()
-        normal = centred.T @ (weight[:, None] * centred) + np.diag(_FLOW_PRIOR * spread + 1e-6)
+        normal = centred.T @ (weight[:, None] * centred) + np.diag(prior * spread + 1e-6)
         step = np.asarray(np.linalg.solve(normal, centred.T @ (weight * change)), np.float64)
     slope = float(np.clip(1.0 + step[axis], 1.0 / _MAX_STEP, _MAX_STEP))
     return slope, float(np.clip(step[1 - axis], -_MAX_TURN, _MAX_TURN))

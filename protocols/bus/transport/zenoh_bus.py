@@ -147,7 +147,7 @@ class _OpenHistory:
 
     question: RecoveryQuery[_Source]
     begun: float
-    replies: deque[zenoh.Reply] = field(default_factory=lambda: deque(maxlen=_MAX_REPLIES))
+    replies: deque[zenoh.Reply]
     failed: bool = False
     reading: threading.Lock = field(default_factory=threading.Lock)
 
@@ -282,7 +282,7 @@ class ZenohSubscription(InboxSubscription):
         """Query one publisher's cache; its replies arrive on a Zenoh thread."""
         source, lock, served = question.source, self._counting, False
         still_open = 1 if question.witness is None else 2
-        opened = _OpenHistory(question, time.monotonic())
+        opened = _OpenHistory(question, time.monotonic(), deque(maxlen=question.most or _MAX_REPLIES))
         history = question.most is not None
         if history:
             with lock:
