@@ -172,7 +172,7 @@ class Backfill(Generic[_Source]):
                 return
             follow: RecoveryQuery[_Source] | None = None
             part = sum(query.low <= number <= query.high for number in held.early)
-            if query.most is not None and served and part >= query.most:
+            if query.most is not None and served and part >= query.most and min(held.early) > held.low:
                 held.high = min(held.early) - 1
                 follow = self._question(who, held)
             elif held.joining and served and not part and query.witness is None and held.later:

@@ -327,7 +327,7 @@ def test_what_was_fetched_of_a_history_whose_time_is_up_continues_in_what_comes_
 
 
 def test_a_history_without_an_answer_of_which_messages_come_is_asked_for_again() -> None:
-    """Of a connection that broke, Zenoh tells only that there are no more replies."""
+    """Of a connection that broke, Zenoh reports only that there are no more replies."""
     stage = Stage()
     stage.backfill.appeared("a", "key-a")
     stage.take("a", 8, 9)
@@ -337,3 +337,10 @@ def test_a_history_without_an_answer_of_which_messages_come_is_asked_for_again()
     stage.after(RETRY_S)
     stage.answer(6, 7, 8, 9)
     assert stage.out == names(6, 7, 8, 9)
+
+
+def test_a_history_that_ends_with_a_part_is_not_asked_for_more() -> None:
+    stage = Stage()
+    stage.take("a", 256)
+    stage.answer(*range(256))
+    assert (stage.out, len(stage.asked)) == (names(*range(257)), 1)
