@@ -1,6 +1,6 @@
 """Loss recovery for reliable topics: the history for a late joiner, and messages lost on the way.
 
-Zenoh's advanced subscriber (1.10.2) does both as well, and fails in three cases in which it should not:
+Zenoh's advanced subscriber (1.10.2) does both as well, and fails in four cases in which it should not:
 
 * It queries the history while it is declared, and delivers it while the caller cannot take anything yet: where it is
   longer than the channel in between, neither ever goes on.
@@ -11,12 +11,15 @@ Zenoh's advanced subscriber (1.10.2) does both as well, and fails in three cases
 * It queries a gap once. If the connection breaks meanwhile, as on a link that loses 30 % of its packets, or if the
   reply takes longer than ten seconds, the query ends without a reply; the missing messages then count as lost,
   although the cache has them.
+* A heartbeat of a publisher that is silent makes it query the whole cache, although the history was fetched. On a slow
+  link the replies delay everything else, and the router closes it: again and again, every six seconds.
 
-Therefore it is not asked for the history: a publisher that appears is queried for what it has, one whose first message
-is not number 0 for the earlier ones, and one whose sequence numbers have a gap is queried for it until the cache has
-confirmed that it has no more of it. Its messages are held back meanwhile. A witness confirms that the query reached the
-cache: a message that it must have. A history is fetched in parts, the newest first: a router closes a link on which
-more waits than passes within seconds, and where the time is up what was fetched continues in what comes by itself.
+Therefore it is not used: a publisher that appears is queried for what it has, one whose first message is not number 0
+for the earlier ones, and one whose sequence numbers have a gap, or stay behind its heartbeats, is queried for it until
+the cache has confirmed that it has no more of it. Its messages are held back meanwhile. A witness confirms that the
+query reached the cache: a message that it must have. All is fetched in parts, the newest first: a router closes a link
+on which more waits than passes within seconds, and where the time is up what was fetched continues in what comes by
+itself.
 
 What a sender says of its publisher's identity and numbers is not authenticated, only its right to a key is. So nothing
 that is learned on one key has an effect on another, and a number far ahead of all others silences nobody: while a gap
@@ -41,13 +44,14 @@ HISTORY_TIMEOUT_S, SILENCE_S = 10.0, 2.0
 a link would bring before them."""
 RETRY_S = 0.3
 """Pause between two queries for one gap."""
+PATIENCE_S = 0.25
+"""For which a message may come later than the heartbeat that announces it: half the period of heartbeats."""
 _MAX_SOURCES, _MAX_OF_KEY = 16_384, 16
 """Publishers that are remembered, and of these of one key: an agent that restarts again and again has as many."""
 _MAX_BYTES, _MAX_BYTES_OF_KEY = 64 * 1024 * 1024, 8 * 1024 * 1024
 """Bytes held back at once, of all publishers together and of one."""
-_PART = 256
-"""Messages of a history that are queried at once: 0.1 to 0.5 MB. 200 publishers' 1,000 each took 2.7 s with 512, 3.2 s
-with 256 and 7 s with 128."""
+MOST_PART = 512
+"""Messages that are queried at once, at most: 0.2 to 1 MB."""
 _SEQUENCE_MODULUS = 2**32  # Zenoh's sequence numbers have 32 bits
 NEWEST = _SEQUENCE_MODULUS // 2 - 1
 """As the end of a query: all there is. Zenoh's cache takes a longer range for one that wraps around: empty."""
@@ -59,7 +63,7 @@ class RecoveryQuery(Generic[_Source]):
 
     witness: number of a message that it must have, queried after them; None = not known. key: the publisher's key.
     number: of the query, to be passed to ``finish`` with the end of its replies. most: only so many of them, the
-    newest; None = a gap, of which all are wanted."""
+    newest; None = all."""
 
     source: _Source
     key: str
@@ -80,13 +84,15 @@ class _PendingMessages:
     since: float
     question: int
     high: int
-    """Up to which it is queried: of a history, what is not yet fetched."""
+    """Up to which it is queried: what is not yet fetched."""
     due: float | None = None
     """When to query again; None while a query is open."""
     heard: float = 0.0
     """When the first message came by itself."""
     continued: bool = False
     """Whether messages that continue those before the gap arrived meanwhile."""
+    announced: int | None = None
+    """Number of a message that its publisher says it has."""
     early: dict[int, bytes] = field(default_factory=dict)
     later: deque[tuple[int, bytes]] = field(default_factory=deque)
     bytes: int = 0
@@ -94,7 +100,7 @@ class _PendingMessages:
     @property
     def witness(self) -> int | None:
         """The newest message that is known: by the time of the reply the cache may have dropped older ones."""
-        return self.later[-1][0] if self.later else max(self.early, default=None)
+        return self.later[-1][0] if self.later else max(self.early, default=self.announced)
 
 
 class Backfill(Generic[_Source]):
@@ -119,6 +125,8 @@ class Backfill(Generic[_Source]):
         self._next: dict[tuple[str, _Source], int] = {}
         self._held: dict[tuple[str, _Source], _PendingMessages] = {}
         self._of_key: dict[str, list[_Source]] = {}
+        self._behind: dict[tuple[str, _Source], tuple[int, float]] = {}
+        """Publishers that have announced more than has arrived: the number that is expected, and since when."""
         self._questions = 0
         self._bytes = 0
         self._lock = threading.Lock()
@@ -151,6 +159,25 @@ class Backfill(Generic[_Source]):
             if who not in self._next:
                 self._remember(who)
             question = self._hold(who, self._next.get(who, 0), NEWEST + 1, joining=True)
+        self._ask(question)
+
+    def heartbeat(self, source: _Source, key: str, number: int) -> None:
+        """A publisher has said that ``number`` is its newest message: if that doesn't arrive, query it."""
+        who, now = (key, source), self._clock()
+        with self._lock:
+            expected = self._next.get(who)
+            if expected is None or who in self._held:
+                return
+            if (number - expected) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2:
+                self._behind.pop(who, None)
+                return
+            since = self._behind.setdefault(who, (expected, now))
+            if since[0] != expected:
+                self._behind[who] = (expected, now)
+            if since[0] != expected or now - since[1] < PATIENCE_S:
+                return
+            del self._behind[who]
+            question = self._hold(who, expected, number + 1, joining=False, announced=number)
         self._ask(question)
 
     def answer(self, query: RecoveryQuery[_Source], number: int, key: str, payload: bytes) -> None:
@@ -243,10 +270,18 @@ class Backfill(Generic[_Source]):
         return self._hold(who, 0, number, payload, joining=True)
 
     def _hold(
-        self, who: tuple[str, _Source], low: int, first: int, payload: bytes | None = None, *, joining: bool
+        self,
+        who: tuple[str, _Source],
+        low: int,
+        first: int,
+        payload: bytes | None = None,
+        *,
+        joining: bool,
+        announced: int | None = None,
     ) -> RecoveryQuery[_Source]:
         """payload: of message ``first``, None where none has arrived."""
         held = self._held[who] = _PendingMessages(low, first, joining, self._clock(), 0, first - 1)
+        held.announced = announced
         self._next[who] = -1  # no message is in sequence while these are held back
         if payload is not None:
             self._append(held, first, payload)
@@ -265,8 +300,7 @@ class Backfill(Generic[_Source]):
     def _question(self, who: tuple[str, _Source], held: _PendingMessages) -> RecoveryQuery[_Source]:
         self._questions += 1
         held.question, held.due = self._questions, None
-        most = _PART if held.joining else None
-        return RecoveryQuery(who[1], who[0], held.low, held.high, held.witness, held.question, most)
+        return RecoveryQuery(who[1], who[0], held.low, held.high, held.witness, held.question, MOST_PART)
 
     def _release(self, who: tuple[str, _Source]) -> RecoveryQuery[_Source] | None:
         """Deliver everything in order up to the next gap, and return the query for that gap."""
@@ -333,6 +367,7 @@ class Backfill(Generic[_Source]):
         held = self._held.pop(who, None)  # of a second gap
         self._bytes -= 0 if held is None else held.bytes
         self._next.pop(who, None)
+        self._behind.pop(who, None)
         sources = self._of_key.get(key, [])
         if source in sources:
             sources.remove(source)

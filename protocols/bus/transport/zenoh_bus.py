@@ -8,7 +8,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from queue import SimpleQueue
 from typing import Any, TypeAlias
 
@@ -19,7 +19,7 @@ from google.protobuf.message import Message
 
 from protocols.bus.base import BusDead, Received
 from protocols.bus.settings import BusConfig
-from protocols.bus.transport.backfill import NEWEST, SILENCE_S, Backfill, RecoveryQuery
+from protocols.bus.transport.backfill import MOST_PART, NEWEST, SILENCE_S, Backfill, RecoveryQuery
 from protocols.bus.transport.inbox import Arrived, InboxSubscription, LivenessTracker, subscription_key
 from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
 from protocols.core.closing import Closing
@@ -30,9 +30,12 @@ from protocols.validation.codec import encode, message_class, parse_key, unknown
 HEARTBEAT_S = 0.5
 """Period after which a subscriber detects that the last message before a pause is missing."""
 _POLL_S = 0.005  # for a matching subscriber
-_HISTORIES_AT_ONCE, _HISTORIES_OF_KEY = 16, 2
-"""In all, and of one key: who does not answer delays no other. Of 200 publishers 1,000 messages each took 2.4 s
-with 1 to 16 at once; with 64 and more the link stalled for seconds, and queries ended without a reply."""
+_QUERIES_AT_ONCE, _QUERIES_OF_KEY = 8, 2
+"""In all, and of one key: who does not answer delays no other. Of 200 publishers 1,000 messages each took 2.2 s with 4
+or 8 at once, 2.7 s with 16; with 64 and more the link stalled for seconds, and queries ended without a reply."""
+_LEAST_PART, _LONGEST_WAIT_S = 16, 0.5
+"""Messages that one query asks for, at least, and for how long it may wait on the link, and what comes by itself behind
+it: over 100 kB/s six cameras with 1.2 MB each kept a seventh silent for 16 s where 256 were asked for, now for 2 s."""
 _GAP_QUERY_S = 10.0  # a third of GAP_TIMEOUT_S: three queries before it is lost
 _CHANNEL, _AT_ONCE = 512, 256
 """Samples between Zenoh and a subscription's thread, 3 ms of a flood: while it is full, Zenoh waits. And of these taken
@@ -41,13 +44,24 @@ _YIELD_S = 1e-4  # after as many: else the reader gets the interpreter's lock ba
 _MAX_REPLIES = 65_536  # to one query: the longest inbox
 _MAX_KEYS, _KEYS_PER_CALL = 8192, 8  # that are declared in all, and by one drain
 
+_HEARTBEAT_BYTES = 4  # the number of a publisher's newest message
 _ADVANCED = "/@adv/pub/"
-"""Between the key of an advanced publisher and its identity, in the keys of its token and its cache."""
+"""Between the key of an advanced publisher and its identity, in the keys of its token, heartbeats and cache."""
 
 _Source: TypeAlias = tuple[str, int]
 """A publisher's identity in Zenoh: session id and entity id."""
 _PLAIN: _Source = ("", 0)
 """A plain publisher, as zenoh-pico's: without recovery, and its gaps are those of its own numbers."""
+
+
+def _publisher(sample: zenoh.Sample) -> tuple[_Source, str] | None:
+    """Of a token or a heartbeat: its publisher and the publisher's key; None of what is neither."""
+    key, _, identity = str(sample.key_expr).partition(_ADVANCED)
+    session, _, entity = identity.partition("/")
+    try:
+        return ((session, int(entity.partition("/")[0])), key) if parse_key(key) is not None else None
+    except ValueError:
+        return None
 
 
 class ZenohPublisher:
@@ -142,7 +156,7 @@ class _DeclaredKeys:
 
 
 @dataclass(slots=True)
-class _OpenHistory:
+class _OpenQuery:
     """A query to a publisher's cache and the replies that were not read yet. failed: whether one was an error."""
 
     question: RecoveryQuery[_Source]
@@ -165,29 +179,29 @@ class ZenohSubscription(InboxSubscription):
         """Held while messages are taken from the channel or decoded: by turns, not alternately for each."""
         self._questions: SimpleQueue[RecoveryQuery[_Source] | None] = SimpleQueue()
         self._backfill: Backfill[_Source] = Backfill(self._push, self._questions.put, self.inbox.count_lost)
-        self._histories: deque[RecoveryQuery[_Source]] = deque()
+        self._waiting: deque[RecoveryQuery[_Source]] = deque()
         """Queries that wait until another one has ended."""
-        self._open_histories: dict[int, _OpenHistory] = {}
+        self._open_queries: dict[int, _OpenQuery] = {}
         self._last_reply = 0.0  # to any of them
+        self._part, self._fastest_s = _LEAST_PART, float("inf")
         self._counting = threading.Lock()
         self._newest: dict[tuple[str, _Source], int] = {}
         self._fetched: dict[tuple[str, _Source], int] = {}
         """Number of the message that was taken from a publisher's cache; it and older ones may yet arrive."""
         self._keys = _DeclaredKeys(session)
-        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         with zenoh_call(f"subscribe {key}"):
-            self._subscriber: zenoh.ext.AdvancedSubscriber[Any] = zenoh.ext.declare_advanced_subscriber(
-                session,
-                key,
-                zenoh.handlers.FifoChannel(_CHANNEL),
-                recovery=recovery if self._reliable else None,
-            )
+            self._subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(_CHANNEL))
         threading.Thread(target=self._collect, args=(self._subscriber.handler,), name=f"bus {key}").start()
         # A query waits for Zenoh's tables, which Zenoh holds while it waits for room in the channel.
         asking = map(self._ask, iter(self._questions.get, None))
         threading.Thread(target=deque, args=(asking, 0), name=f"recovery {key}").start()
         try:
             with zenoh_call(f"watch {key}"):
+                # The oldest of too many heartbeats are dropped: each is said again.
+                self._heartbeats: zenoh.Subscriber[Any] | None = None
+                if self._reliable:
+                    ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
+                    self._heartbeats = session.declare_subscriber(f"{key}{_ADVANCED}**", ring)
                 self._publishers: zenoh.Subscriber[None] = session.liveliness().declare_subscriber(
                     f"{key}{_ADVANCED}**", zenoh.handlers.Callback(self._appeared, indirect=False), history=True
                 )
@@ -198,18 +212,20 @@ class ZenohSubscription(InboxSubscription):
 
     def _appeared(self, token: zenoh.Sample) -> None:
         """Query the history of a publisher that has appeared; called from Zenoh's threads."""
-        key, _, identity = str(token.key_expr).partition(_ADVANCED)
-        try:
-            session, entity = identity.split("/")[:2]
-            source = session, int(entity)
-        except ValueError:
+        if token.kind != zenoh.SampleKind.PUT or (publisher := _publisher(token)) is None:
             return
-        if token.kind != zenoh.SampleKind.PUT or parse_key(key) is None:
-            return
+        source, key = publisher
         if self._reliable:
             self._backfill.appeared(source, key)
         else:
             self._questions.put(RecoveryQuery(source, key, 0, NEWEST, None, 0))
+
+    def _take_heartbeats(self, heartbeats: zenoh.Subscriber[Any]) -> None:
+        with suppress(zenoh.ZError):  # undeclared
+            while (beat := heartbeats.handler.try_recv()) is not None:
+                number = beat.payload.to_bytes()
+                if len(number) == _HEARTBEAT_BYTES and (publisher := _publisher(beat)) is not None:
+                    self._backfill.heartbeat(*publisher, int.from_bytes(number, "little"))
 
     def _collect(self, channel: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """Queue what arrives, until the subscription is closed.
@@ -282,14 +298,15 @@ class ZenohSubscription(InboxSubscription):
         """Query one publisher's cache; its replies arrive on a Zenoh thread."""
         source, lock, served = question.source, self._counting, False
         still_open = 1 if question.witness is None else 2
-        opened = _OpenHistory(question, time.monotonic(), deque(maxlen=question.most or _MAX_REPLIES))
-        history = question.most is not None
-        if history:
+        if self._reliable:
+            question = replace(question, most=self._part)
+        opened = _OpenQuery(question, time.monotonic(), deque(maxlen=question.most or _MAX_REPLIES))
+        if self._reliable:
             with lock:
                 if not self._may_ask(question):
-                    self._histories.append(question)
+                    self._waiting.append(question)
                     return
-                self._open_histories[question.number] = opened
+                self._open_queries[question.number] = opened
 
         def witnessed(reply: zenoh.Reply) -> None:
             nonlocal served
@@ -302,10 +319,10 @@ class ZenohSubscription(InboxSubscription):
                 still_open -= 1
                 if still_open:
                     return
-                self._open_histories.pop(question.number, None)
-            if history:
-                self._ask_next()
+                self._open_queries.pop(question.number, None)
+                self._adapt_part(question.most, time.monotonic() - opened.begun)
             if self._reliable:
+                self._ask_next()
                 self._backfill.finish(question, served or (question.witness is None and not opened.failed))
             self.inbox.push_all(self._arrived)
 
@@ -331,22 +348,31 @@ class ZenohSubscription(InboxSubscription):
             self._backfill.finish(question, served=False)
             self.inbox.push_all(self._arrived)
 
+    def _adapt_part(self, most: int | None, seconds: float) -> None:
+        """Ask for more at once, or less, by how much longer than the fastest answer one took: it waited on the link."""
+        self._fastest_s = min(self._fastest_s, seconds)
+        waited = seconds - self._fastest_s
+        if waited > _LONGEST_WAIT_S:
+            self._part = max(self._part // 2, _LEAST_PART)
+        elif waited < 0.5 * _LONGEST_WAIT_S and most == self._part:
+            self._part = min(2 * self._part, MOST_PART)
+
     def _may_ask(self, question: RecoveryQuery[_Source]) -> bool:
-        keys = [one.question.key for one in self._open_histories.values()]
-        return keys.count(question.key) < _HISTORIES_OF_KEY and len(keys) < _HISTORIES_AT_ONCE
+        keys = [one.question.key for one in self._open_queries.values()]
+        return keys.count(question.key) < _QUERIES_OF_KEY and len(keys) < _QUERIES_AT_ONCE
 
     def _ask_next(self) -> None:
         """Of the queries that wait, the first whose turn it is."""
         with self._counting:
-            if (following := next(filter(self._may_ask, self._histories), None)) is not None:
-                self._histories.remove(following)
+            if (following := next(filter(self._may_ask, self._waiting), None)) is not None:
+                self._waiting.remove(following)
                 self._questions.put(following)
 
-    def _read_histories(self) -> None:
+    def _read_replies(self) -> None:
         """Take what has come of them; those whose publishers do not answer no longer keep others waiting."""
         now = time.monotonic()
         with self._counting:
-            opened = list(self._open_histories.values())
+            opened = list(self._open_queries.values())
         for one in opened:
             if one.replies:
                 self._last_reply = now
@@ -355,10 +381,10 @@ class ZenohSubscription(InboxSubscription):
         if silent:
             with self._counting:
                 for one in silent:
-                    self._open_histories.pop(one.question.number, None)
+                    self._open_queries.pop(one.question.number, None)
             self._ask_next()
 
-    def _read(self, opened: _OpenHistory) -> None:
+    def _read(self, opened: _OpenQuery) -> None:
         question, replies = opened.question, opened.replies
         with opened.reading:
             while replies:
@@ -375,9 +401,11 @@ class ZenohSubscription(InboxSubscription):
     def drain(self) -> list[Received]:
         """Everything since the last call."""
         self._keys.declare()
+        if self._heartbeats is not None:
+            self._take_heartbeats(self._heartbeats)
         self._backfill.poll()
-        if self._open_histories:
-            self._read_histories()
+        if self._open_queries:
+            self._read_replies()
         if self._arrived:
             self.inbox.push_all(self._arrived)
         with self._turn:
@@ -385,7 +413,7 @@ class ZenohSubscription(InboxSubscription):
 
     def close(self) -> None:
         """Undeclare: a process with an open subscription never exits."""
-        undeclare_all(self._publishers, self._subscriber)
+        undeclare_all(self._publishers, self._heartbeats, self._subscriber)
         self._questions.put(None)
         self._keys.close()
 

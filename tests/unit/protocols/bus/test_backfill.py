@@ -6,6 +6,7 @@ from protocols.bus.transport.backfill import (
     GAP_TIMEOUT_S,
     HISTORY_TIMEOUT_S,
     NEWEST,
+    PATIENCE_S,
     RETRY_S,
     SILENCE_S,
     Backfill,
@@ -306,21 +307,21 @@ def test_a_forged_number_alone_does_not_outlast_what_the_camera_has_published() 
 def test_a_history_is_fetched_in_parts_the_newest_first() -> None:
     stage = Stage()
     stage.backfill.appeared("a", "key-a")
-    stage.take("a", 400)
-    stage.answer(*range(144, 400))
+    stage.take("a", 656)
+    stage.answer(*range(144, 656))
     assert (stage.out, [query.high for query in stage.asked]) == ([], [NEWEST, 143])
     stage.answer(*range(100, 120), served=False)
     stage.after(RETRY_S)
     assert [query.high for query in stage.asked] == [NEWEST, 143, 143], "a part whose time is up is asked for again"
     stage.answer(*range(100, 144))
-    assert (stage.out, len(stage.asked), stage.lost) == (names(*range(100, 401)), 3, 0)
+    assert (stage.out, len(stage.asked), stage.lost) == (names(*range(100, 657)), 3, 0)
 
 
 def test_what_was_fetched_of_a_history_whose_time_is_up_continues_in_what_comes_by_itself() -> None:
     stage = Stage()
     stage.backfill.appeared("a", "key-a")
-    stage.take("a", 400)
-    stage.answer(*range(144, 400))
+    stage.take("a", 656)
+    stage.answer(*range(144, 656))
     stage.after(HISTORY_TIMEOUT_S + 0.1)
     stage.take("a", 401)
     assert (stage.out, stage.lost) == (names(*range(144, 402)), 0)
@@ -344,3 +345,42 @@ def test_a_history_that_ends_with_a_part_is_not_asked_for_more() -> None:
     stage.take("a", 256)
     stage.answer(*range(256))
     assert (stage.out, len(stage.asked)) == (names(*range(257)), 1)
+
+
+def test_the_last_message_before_a_pause_is_asked_for_by_its_heartbeats() -> None:
+    stage = Stage()
+    stage.take("a", 0, 1)
+    stage.backfill.heartbeat("a", "key-a", 3)
+    assert stage.asked == [], "it may be on its way"
+    stage.now += PATIENCE_S
+    stage.backfill.heartbeat("a", "key-a", 3)
+    assert [(q.low, q.high, q.witness) for q in stage.asked] == [(2, 3, 3)]
+    stage.answer(served=False)
+    stage.after(RETRY_S)
+    assert (len(stage.asked), stage.lost) == (2, 0), "a connection that breaks loses nothing"
+    stage.take("a", 4)
+    stage.answer(2, 3)
+    assert (stage.out, stage.lost) == (names(0, 1, 2, 3, 4), 0)
+
+
+def test_who_has_sent_all_that_its_heartbeats_announce_is_not_asked() -> None:
+    stage = Stage()
+    for number in range(4):  # each arrives after the heartbeat that announces it
+        stage.backfill.heartbeat("a", "key-a", number)
+        stage.take("a", number)
+        stage.now += PATIENCE_S
+        stage.backfill.heartbeat("a", "key-a", number)
+    stage.backfill.heartbeat("b", "key-b", 9)  # its token has not come yet
+    assert stage.asked == []
+
+
+def test_a_gap_is_fetched_in_parts_the_newest_first() -> None:
+    stage = Stage()
+    stage.take("a", 0, 601)
+    most = stage.asked[-1].most
+    assert most is not None
+    stage.answer(*range(600, 600 - most, -1))
+    assert [(q.low, q.high) for q in stage.asked] == [(1, 600), (1, 600 - most)]
+    stage.answer(*range(600 - most, 600 - 2 * most, -1))
+    stage.answer(*range(600 - 2 * most, 0, -1))
+    assert (stage.out, stage.lost) == (names(*range(602)), 0)
