@@ -323,8 +323,8 @@ def test_what_was_fetched_of_a_history_whose_time_is_up_continues_in_what_comes_
     stage.take("a", 656)
     stage.answer(*range(144, 656))
     stage.after(HISTORY_TIMEOUT_S + 0.1)
-    stage.take("a", 401)
-    assert (stage.out, stage.lost) == (names(*range(144, 402)), 0)
+    stage.take("a", 657)
+    assert (stage.out, stage.lost) == (names(*range(144, 658)), 0)
 
 
 def test_a_history_without_an_answer_of_which_messages_come_is_asked_for_again() -> None:
@@ -342,9 +342,9 @@ def test_a_history_without_an_answer_of_which_messages_come_is_asked_for_again()
 
 def test_a_history_that_ends_with_a_part_is_not_asked_for_more() -> None:
     stage = Stage()
-    stage.take("a", 256)
-    stage.answer(*range(256))
-    assert (stage.out, len(stage.asked)) == (names(*range(257)), 1)
+    stage.take("a", 512)
+    stage.answer(*range(512))
+    assert (stage.out, len(stage.asked)) == (names(*range(513)), 1)
 
 
 def test_the_last_message_before_a_pause_is_asked_for_by_its_heartbeats() -> None:
