@@ -90,6 +90,24 @@ def test_a_gap_is_asked_for_until_the_cache_has_answered(monkeypatch: pytest.Mon
         assert subscription.counters["lost"] == 0
 
 
+def test_the_last_messages_before_a_pause_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    take = ZenohSubscription._take
+
+    def without_the_end(self: ZenohSubscription, sample: zenoh.Sample) -> object:
+        wanted = sample.source_info is None or sample.source_info.source_sn < 8
+        return take(self, sample) if wanted else None
+
+    monkeypatch.setattr(ZenohSubscription, "_take", without_the_end)
+    with connected() as (sending, receiving):
+        subscription = receiving.subscribe(OBSERVATION)
+        publisher = matched(sending.publisher(OBSERVATION, "cam0"))
+        publisher.put(observation("cam0", 0))
+        received = collect(subscription, 1)  # its history is complete
+        for index in range(1, 10):
+            publisher.put(observation("cam0", index))
+        assert sequences([*received, *collect(subscription, 9)]) == list(range(10))
+
+
 def test_the_histories_of_more_publishers_than_are_asked_at_once_arrive() -> None:
     with connected() as (sending, receiving):
         cameras = [f"cam{number:02d}" for number in range(40)]
