@@ -54,6 +54,7 @@ _SCALE_GAIN = 0.5  # of the scale filter's correction, per frame
 _ANCHOR_GAIN = 0.02  # similarity to the first view that another size, shape or angle must gain
 _TURN_GAIN = 0.08  # and that a turn must have gained: as much as the same thing changes from one image to another
 _ANCHOR_STEP = 0.3  # share of the way to it
+_TURNS_S = 0.7  # for which a target goes on to turn: a bend that is driven through takes as long
 _UPRIGHT = 0.02  # rad: a smaller turn moves no corner of the box by a cell of a template
 _EXTENT_STEP = 0.3  # share of the way to the extent that the colours measure
 _SURE_STD = 0.5  # of where it must be since the evidence was clear, in lengths, to go back to that
@@ -77,7 +78,7 @@ class AppearanceTracker:
         self.box = OrientedBox.upright(target)
         self._first = self.box.sides
         self._motion_filter = VelocityFilter(self.length)
-        self._turn_rate = 0.0
+        self._turn_rate = self._turned = 0.0
         self._scene.update(image, None)
         image = self._scene.photometric.corrected(image)  # begun again, what is learnt has the exposure of the first
         self.motion: Motion = STILL
@@ -174,11 +175,11 @@ class AppearanceTracker:
         elif expected is None and (self._missed or self._time - self._trusted_at < _FAST_PAN_S):
             for moving in (self._motion_filter, velocity):
                 moving.lose_scene(_UNKNOWN_STEP * self._size[0])
+        self._turn_rate *= float(np.exp(-dt / _TURNS_S))
+        self._turned = self._turn_rate * dt
+        box = box.turned(self._turned)
         if self._missed:
-            angle = self._turn_rate * dt
-            self._motion_filter.turn(angle)
-            self._turn_rate *= float(np.exp(-dt / 0.7))
-            box = box.turned(angle)
+            self._motion_filter.turn(self._turned)
         self.box = box.at(origin + self._motion_filter.predict(dt, self.length))
         self._sure = sure.at(sure.centre + velocity.predict(dt, self.length)), velocity
         if expected is not None:
@@ -286,7 +287,7 @@ class AppearanceTracker:
         wider, higher, turn = self._flow.change(image, box, stood) if inside > _SIZE_INSIDE else (1.0, 1.0, 0.0)
         box = box.sized(box.sides * [wider, higher]).turned(turn)
         if inside > _LEARN_INSIDE:
-            self._turn_rate += min(1.0, 4.0 * dt) * (turn / dt - self._turn_rate)
+            self._turn_rate += min(1.0, 4.0 * dt) * ((self._turned + turn) / dt - self._turn_rate)
             if self._frame % 3 == 0:
                 box = self._anchored(image, box)
                 extent = self._shape.measured(image, box)

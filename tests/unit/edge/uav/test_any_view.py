@@ -143,6 +143,25 @@ def test_the_box_turns_with_a_view_that_turns_from_the_first_image_on(scene: Ima
         assert np.degrees(tracker.box.angle) == pytest.approx(-1.5 * k, abs=8.0)
 
 
+def test_the_box_turns_with_a_target_that_drives_through_a_bend(scene: Image) -> None:
+    car = np.full((26, 60, 3), (40, 40, 200), np.uint8)
+    car[4:22, 10:20], car[4:22, 35:48] = 30, 220
+    corners = np.array([[0.0, 0.0], [59.0, 0.0], [59.0, 25.0], [0.0, 25.0]])
+    tracker, place = AppearanceTracker(SIZE, FPS), np.array([60.0, 60.0])
+    for k in range(75):
+        turn = np.radians(1.2 * k)
+        axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        place = place + 2.0 * axes[:, 0]
+        matrix = np.column_stack([axes, place - axes @ [29.5, 12.5]])
+        image = np.ascontiguousarray(scene[200 : 200 + SIZE[1], 300 : 300 + SIZE[0]])
+        cv2.warpAffine(car, matrix, SIZE, image, borderMode=cv2.BORDER_TRANSPARENT)
+        seen = corners @ axes.T + matrix[:, 2]
+        low, sides = seen.min(axis=0), np.ptp(seen, axis=0) + 1.0
+        found = tracker.begin(image, 0.0, Box(*low, *sides)) if k == 0 else tracker.handle_frame(image, k / FPS)
+        assert [found.x, found.y] == pytest.approx(seen.mean(axis=0), abs=6.0)
+    assert np.degrees(tracker.box.angle) == pytest.approx(1.2 * 74, abs=30.0)
+
+
 def test_the_box_of_a_target_that_is_away_may_grow_far_beyond_a_view_that_zooms_in(scene: Image) -> None:
     image = scene[: SIZE[1], : SIZE[0]].copy()
     tracker = AppearanceTracker(SIZE, FPS)
