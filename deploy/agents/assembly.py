@@ -147,7 +147,7 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
 
     def keep(hub: LiveHub) -> None:
         if config.solve and known is None and hub.calibration is not None and hub.session is not None:
-            store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.links.delays)
+            store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.delays)
         note(hub)
 
     def note(hub: LiveHub) -> None:

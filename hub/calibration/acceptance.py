@@ -188,7 +188,7 @@ def _fit(reconstruction: Reconstruction) -> CameraTests:
         ]
         if reconstruction.problem.free_parameters.pose:
             reason = f"only {count} of its {fits}"
-            out[name].append(AcceptanceTest("observations", count, _MIN_ROWS, "", "five rows an unknown", reason, ">="))
+            out[name].append(PrecisionTest("observations", count, _MIN_ROWS, "", "five rows an unknown", reason, ">="))
     return out
 
 
