@@ -383,6 +383,13 @@ class ZenohSubscription(InboxSubscription):
         with self._turn:
             return super().drain()
 
+    def flush(self) -> None:
+        """Queue what was fetched and what waits for it."""
+        if self._open_histories:
+            self._read_histories()
+        self._backfill.flush()
+        self.inbox.push_all(self._arrived)
+
     def close(self) -> None:
         """Undeclare: a process with an open subscription never exits."""
         undeclare_all(self._publishers, self._subscriber)
