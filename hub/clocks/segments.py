@@ -42,13 +42,18 @@ class ClockSegments:
         self.alarms: dict[str, str] = {}
         self._changes: Counter[str] = Counter()
 
-    def assign(self, message: pb.Observation, arrival: float | None) -> tuple[pb.Observation, ClockChange | None]:
-        """The observation with its clock segment as boot id, and the clock change that begins with it, if any."""
+    def assign(
+        self, message: pb.Observation, arrival: float | None, *, waited: bool = False
+    ) -> tuple[pb.Observation, ClockChange | None]:
+        """The observation with its clock segment as boot id, and the clock change that begins with it, if any.
+
+        arrival, waited: as of `ClockChangeDetector.handle`.
+        """
         camera, boot = message.camera, message.boot_id
         if self._changes.get(camera, 0) >= _MAX_CHANGES:
             return message, None
         segment, change = self._detector.handle(
-            camera, boot, message.sequence, message.frame, message.device_time_ns, arrival
+            camera, boot, message.sequence, message.frame, message.device_time_ns, arrival, waited=waited
         )
         self._runs[camera] = boot
         if change is not None:

@@ -259,7 +259,7 @@ class _HubAgent:
         behind = f"messages wait of {', '.join(shares.behind[:8])}" if shares.behind else ""
         advice = [one.text for one in hub.guidance.advice()] if needs_advice else []
         shared = "" if self._shard is None else self._shard.text()
-        texts = (shed, status.message, shared, behind, *advice, self._last_action)
+        texts = (shed, behind, status.message, shared, *advice, self._last_action)
         status.message = "; ".join(text for text in texts if text)[:_MAX_TEXT]
         return status
 
@@ -300,10 +300,12 @@ def status_message(
         message.message += f"; motion shared with another camera: {', '.join(shared)}" if shared else ""
     elif hub.calibration is not None and (left := set(hub.stream.marker.cameras) - hub.calibration.cameras.keys()):
         reasons = {one.camera: f" ({one.reason})" if one.reason else "" for one in hub.progress()}
+        # Not the reason again that degrades the hub.
+        reasons = {name: "" if why[2:-1] in message.message else why for name, why in reasons.items()}
         named = ", ".join(f"{name}{reasons.get(name, '')}" for name in sorted(left)[:_NAMED_CAMERAS])
         message.message += f"; heard but not calibrated: {named}"
     alarms = [*hub.stream.clocks.alarms.values(), *hub.clock_contradictions()]
-    message.message = "; ".join(filter(None, [*alarms, message.message, hub.unmatched(now)]))[:1000]
+    message.message = "; ".join(filter(None, [*alarms, hub.unmatched(now), message.message]))[:1000]
     _add_parts(message, hub, now)
     for counts in counters:
         for name, count in counts.items():

@@ -51,7 +51,8 @@ def overview(state: ViewState, now: float) -> str:
     headline = f"<b class='headline'>{html.escape(word)}</b>{html.escape(colon + rest)}"
     lines = [f"<p data-syncline='headline' data-hub='{html.escape(state.hub_state, quote=True)}'>{headline}"]
     if problems := state.problems(now):
-        lines.append(f"<br><b data-syncline='health'>▲ degraded: {html.escape('; '.join(problems))}</b>")
+        listed = "<br>▲ ".join(html.escape(problem) for problem in problems)
+        lines.append(f"<br><b data-syncline='health'>▲ degraded: {listed}</b>")
     lines.append("</p>")
     if needs_guidance(state):
         lines += [f"<p data-syncline='guide'>☞ {html.escape(step)}</p>" for step in state.next_steps()]
