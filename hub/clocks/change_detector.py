@@ -202,7 +202,7 @@ class ClockChangeDetector:
             spread = max(1.5 * float(np.median(np.abs(np.array(clock.periods) - period))), 1e-4)
             # The error of the period, which is a median, grows with every frame that is missing.
             std = spread * math.hypot(math.sqrt(frames), frames * math.sqrt(0.5 * math.pi / len(clock.periods)))
-            if abs(step) < _STEP_SIGMAS * std or self._has_usual_delay(clock, time, arrival):
+            if abs(step) < _STEP_SIGMAS * std or self._has_usual_delay(clock, time, arrival, step):
                 return None
             if 0.0 < step < _LONGEST_PAUSE_S and (waited or self._is_fetched(clock, last_time, arrival)):
                 return None  # as likely frames that the camera did not count
@@ -216,7 +216,7 @@ class ClockChangeDetector:
         return None
 
     @staticmethod
-    def _has_usual_delay(clock: _ClockState, time: float, arrival: float | None) -> bool:
+    def _has_usual_delay(clock: _ClockState, time: float, arrival: float | None, step: float) -> bool:
         """Whether both clocks have advanced: of a camera that stalled without counting frames, for one.
 
         By the last frame, and by the frames before that: of a machine that was suspended the last frame arrived late.
@@ -228,7 +228,9 @@ class ClockChangeDetector:
         usual = [last_arrival - last_time]
         if clock.bins:
             usual.append(float(np.median([delay for _, delay in list(clock.bins)[-_USUAL_BINS:]])))
-        return min(abs(arrival - time - delay) for delay in usual) < MIN_STEP_S
+        # A clock that is set forward makes frames seem earlier, never later.
+        earliest, latest = (-max(MIN_STEP_S, 0.5 * step), math.inf) if step > 0.0 else (-MIN_STEP_S, MIN_STEP_S)
+        return any(earliest < arrival - time - delay < latest for delay in usual)
 
     @staticmethod
     def _is_fetched(clock: _ClockState, time: float, arrival: float | None) -> bool:

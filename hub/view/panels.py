@@ -34,7 +34,7 @@ _STYLE = (
     ".sl th{text-align:right;font-weight:600;padding:1px 4px;border-bottom:1px solid #888;white-space:nowrap}"
     ".sl td{text-align:right;padding:1px 4px;white-space:nowrap}"
     ".sl td:first-child,.sl th:first-child{text-align:left;white-space:normal;overflow-wrap:anywhere}"
-    ".sl .clock td{white-space:normal;padding:0 4px 3px 1.6em;color:#444}"
+    ".sl th:first-child{min-width:5em}.sl .clock td{white-space:normal;padding:0 4px 3px 1.6em;color:#444}"
     ".sl .bad{font-weight:700}.sl p{margin:.35em 0}.sl .grid{font-family:monospace;line-height:1;white-space:pre}"
     ".sl .headline{font-size:15px}.sl .tiles{display:grid;grid-template-columns:repeat(auto-fill,minmax(130px,1fr));"
     "gap:6px}.sl figure{margin:0}.sl .frame{position:relative;background:#e8e8e8;aspect-ratio:4/3;display:flex;"

@@ -75,6 +75,19 @@ def test_a_machine_that_was_suspended_is_not_a_step(counts_frames: bool) -> None
     assert [event.step_s for event in camera.events] == pytest.approx([10.0], abs=1e-3)
 
 
+@pytest.mark.parametrize(("step_ns", "steps"), [(0, 0), (500_000_000, 1)])
+def test_a_late_frame_after_a_pause_is_no_step(step_ns: int, steps: int) -> None:
+    """Over a link with 0.3 s of jitter; a clock that is set forward makes the frame seem earlier."""
+    camera = Camera()
+    camera.frames(100)
+    camera.now_ns, camera.number = camera.now_ns + 500_000_000, camera.number + 1
+    camera.arrival += (500_000_000 - step_ns) * 1e-9 + 0.25 * (not step_ns)
+    camera.feed()
+    camera.arrival -= 0.25 * (not step_ns)
+    camera.frames(100)
+    assert len(camera.events) == steps
+
+
 @pytest.mark.parametrize("is_told", [True, False])
 @pytest.mark.parametrize(("step_s", "steps"), [(0.45, 0), (30.0, 0), (-0.45, 1), (1.7e9, 1)])
 def test_of_frames_that_waited_for_the_hub_a_pause_is_no_step(step_s: float, steps: int, is_told: bool) -> None:
