@@ -303,7 +303,9 @@ class ClockChangeDetector:
         self._changes[refinement.change_index] = replace(change, rate_change=rate_change, step_s=step)
         if refinement.count >= _RATE_REFINEMENT_BINS:
             clock.refinement = None
-            if abs(refinement.slope_change) < _FALSE_ALARM_SHARE * abs(refinement.first_slope_change):
+            if abs(refinement.recent_slope) < _FALSE_ALARM_SHARE * abs(refinement.first_slope_change):
+                # The delays have changed, and the clock as little as another route changes it.
+                self._changes[refinement.change_index] = replace(change, rate_change=0.0, step_s=0.0)
                 for span in (WINDOW_BINS[0], WINDOW_BINS[-1]):
                     seen = clock.slope_power.get(span, 0.0)
                     clock.slope_power[span] = seen + _FALSE_ALARM_WEIGHT * (refinement.first_slope_change**2 - seen)

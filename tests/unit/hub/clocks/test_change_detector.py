@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -308,3 +309,22 @@ def test_a_false_alarm_is_not_extrapolated(sign: float) -> None:
     (event,) = detector.changes_since("cam0", "b")
     assert abs(event.rate_change) < 1.5e-4
     assert abs(event.step_s + event.rate_change * (55.0 - event.detected_at_s)) < 2.5e-3
+
+
+@pytest.mark.parametrize(("late_s", "ppm", "remains"), [(3e-3, 0.0, False), (0.0, -300.0, True)])
+def test_an_alarm_that_the_seconds_after_do_not_confirm_is_withdrawn(late_s: float, ppm: float, remains: bool) -> None:
+    """A hub that has just begun is busy for seconds, and frames are late by less and less."""
+    segments, rng, seen = ClockSegments(), np.random.default_rng(8), set[str]()
+    for number in range(30 * 60):
+        true = number / 30.0
+        shown = true + 1e-6 * ppm * max(0.0, true - 25.0)
+        late = 2e-3 + late_s / (1.0 + math.exp(true - 25.0)) + float(rng.exponential(3e-4))
+        message = pb.Observation(camera="cam0", boot_id="b", sequence=number, frame=number)
+        message.device_time_ns = round(shown * 1e9)
+        segments.assign(message, 100.0 + true + late)
+        seen |= segments.alarms.keys()
+    assert seen == {"cam0"}
+    assert [text.split()[4] for text in segments.alarms.values()] == (["drifts"] if remains else [])
+    (change,) = segments._detector.changes_since("cam0", "b")
+    assert change.rate_change == pytest.approx(1e-6 * ppm, abs=5e-6)
+    assert change.step_s == pytest.approx(0.0, abs=2e-3)
