@@ -138,7 +138,7 @@ def _progress_lines(seen: Callable[[Any], None]) -> Callable[[Any], None]:
         seen(status)
         now = time.monotonic()
         waits = status.state == "starting" and now - printed >= _PROGRESS_S
-        if status.message != text and (waits or status.state == "stopping"):
+        if status.message != text and (waits or (status.state == "stopping" and status.role == "hub")):
             printed, text = now, status.message
             print(text, flush=True)
 

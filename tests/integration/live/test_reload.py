@@ -16,6 +16,7 @@ from hub.live.live_hub import LiveHub, LiveSettings
 from hub.live.scheduled_hub import ScheduledHub
 from hub.live.solver import SolverJob
 from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.core.errors import Refused
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import read_calibration
@@ -172,6 +173,20 @@ def test_a_camera_that_comes_back_goes_on_from_its_pose(session: Session, kept: 
     assert hub.state(24.0) == ("calibrated", "3 cameras calibrated")
     clock = hub.calibration.cameras["cam1"].time_map
     assert abs(session.clock_error("cam1", hub.calibration.reference, clock)) < 1e-3
+
+
+def test_a_hub_that_finds_nothing_after_its_restart_keeps_the_files_of_before(
+    session: Session, kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was stopped before anything moved, and calibration.toml was removed."""
+    file = tmp_path / "calibration.toml"
+    file.write_bytes((kept / LAST).read_bytes())
+    hub = LiveHub(SETTINGS)
+    hub.session, hub.refusal = (session.rig, session.observations()), Refused("the point hardly moves")
+    write_last(hub, tmp_path)
+    assert file.read_bytes() == (kept / LAST).read_bytes()
+    assert f"no answer: the point hardly moves; kept: {file}, of before" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_where_the_solver_fails_a_reloaded_answer_is_dropped_in_time(
