@@ -296,7 +296,8 @@ def status_message(
     message.gauges["silent_cameras"] = sum(age > SILENT_S for age in ages.values())
     if state in ("collecting", "searching"):
         # What is waited for, per camera: the search needs motion that two cameras see at the same time.
-        shared = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in hub.progress()[:_NAMED_CAMERAS]]
+        progress = [one for one in hub.progress() if one.shared_motion_s > 0.0 or not hub.stream.people.cameras]
+        shared = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in progress[:_NAMED_CAMERAS]]
         message.message += f"; motion shared with another camera: {', '.join(shared)}" if shared else ""
     elif hub.calibration is not None and (left := set(hub.stream.marker.cameras) - hub.calibration.cameras.keys()):
         reasons = {one.camera: f" ({one.reason})" if one.reason else "" for one in hub.progress()}

@@ -277,7 +277,7 @@ class LiveHub:
         ready = [name for name, rows in rows_by_camera.items() if rows >= self.settings.least_rows]
         film, least = self.stream.marker.film_s, min(_FILM_PER_CAMERA_S * len(cameras), LONG_FILM_S)
         if self.calibration is None and film < least:
-            return f"filmed for {film:.0f} s yet: {len(cameras)} cameras need {least:.0f} s"
+            return f"filmed for {film:.1f} s yet: {len(cameras)} cameras need {least:.1f} s"
         if len(ready) < 2 and self.stream.people.cameras:
             durations = {name: self.stream.people.seconds(name) for name in self.stream.people.cameras}
             if sum(seconds >= _MIN_PEOPLE_S for seconds in durations.values()) < 2:
@@ -404,16 +404,18 @@ class LiveHub:
         tied = {} if self.calibration is None else self.calibration.cameras
         waiting = {} if self.calibration is None else self.calibration.refused
         out = []
-        shared = self.stream.marker.shared_motions_s()
+        shared, of_people = self.stream.marker.shared_motions_s(), not self._has_marker()
         for name in self.stream.marker.cameras:
             fault = self.links.standing.get(name) or self._pixel_faults.get(name)
             reason = fault or waiting.get(name, refused.get(name, ""))
-            rows, least = self.stream.marker.rows(name), self.settings.least_rows
+            rows, least, what = float(self.stream.marker.rows(name)), float(self.settings.least_rows), "detections"
+            if of_people:
+                rows, least, what = self.stream.people.seconds(name), _MIN_PEOPLE_S, "s of people"
             state = "searching" if rows >= least else "collecting"
             if not self.stream.has_info(name):
                 reason = "no CameraInfo yet: it holds the image size and the lens"
             elif state == "collecting" and not reason:
-                reason = f"{rows} of {least} detections"
+                reason = f"{rows:.0f} of {least:.0f} {what}"
             if name in tied:
                 silent = self._now - self.links.last_frame.get(name, self._now) > SILENT_S
                 state, reason = ("degraded", "no frames") if silent else ("calibrated", "")

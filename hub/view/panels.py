@@ -77,7 +77,7 @@ def waiting_html(state: ViewState) -> str:
     for camera in state.cameras.values():
         progress, share = camera.progress, state.guidance.coverage(camera.name)
         parts = [camera.reason[:120]] if camera.reason else []
-        if progress is not None:
+        if progress is not None and (progress.shared_motion_s > 0.0 or state.guidance.target != "person"):
             parts.append(f"{progress.shared_motion_s:.0f} s of motion shared with another camera")
         wanted = f"{100 * MIN_COVERAGE:.0f} % wanted"
         parts.append(f"{state.guidance.target} seen in {100 * share:.0f} % of its view, {wanted}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from deploy.cli import run
 from deploy.demo.people import score_log
 from deploy.simulation.session import camera_tables
 from edge import scenes
-from hub.live.agent import run_hub
+from hub.live.agent import run_hub, status_message
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
@@ -26,7 +27,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import read_calibration
 from protocols.topics import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
 from tests.support.people_traffic import Traffic, film
-from tests.support.samples import eventually
+from tests.support.samples import camera_info, eventually
 from tests.support.threads import running
 
 SCENE = scenes.get_people_scene(21, 4, 3)
@@ -86,6 +87,19 @@ def test_a_replayed_log_tracks_everybody_with_equal_bytes(log: Path, known: Path
     assert len(rows) > 100
     heads = [m.message for m in LogReader(tmp_path / "one.mcap").messages([PREDICTION])]
     assert any(target.face for message in heads for camera in message.cameras for target in camera.targets)  # type: ignore[attr-defined]
+
+
+def test_what_is_waited_for_of_people_is_said_of_people(traffic: Traffic) -> None:
+    """The page said `0 of 90 detections` of cameras that each saw four people."""
+    hub = LiveHub()
+    for message in traffic.messages():
+        hub.handle(message)
+    for name in hub.stream.people.cameras:
+        hub.handle(camera_info(name))
+    assert all(re.fullmatch(r"[1-9]\d* of 40 s of people", one.reason) for one in hub.progress()), hub.progress()
+    status = status_message(hub, "hub", "boot", 0, [])
+    assert "observed too briefly yet" in status.message
+    assert "motion shared" not in status.message
 
 
 @pytest.mark.parametrize(("stated", "up"), [(np.array([0.0, -2.0, 0.0]), [0, -1, 0]), (None, None)])
