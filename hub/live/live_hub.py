@@ -463,10 +463,12 @@ class LiveHub:
         except Refused as refusal:
             self.refusal = refusal
             return []
-        except InputError as error:
-            # Invalid input is a camera's fault that must not stop the hub.
+        except Exception as error:  # noqa: BLE001 - whatever is wrong with the rows must not stop the hub
             self.counters["bad_sessions"] += 1
-            self.refusal = Refused(str(error))
+            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            self.refusal = Refused(f"{kind}{error}")
+            if self.calibration is not None:
+                self.solver_failure = self.refusal.reason
             return []
         self._schedule.readmit(now)
         left_out = self._schedule.left_out

@@ -20,6 +20,7 @@ from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
@@ -154,3 +155,12 @@ def test_tracks_and_predictions_come_over_the_bus(traffic: Traffic, known: Path)
     assert np.linalg.norm(truth[:, :2] - np.array(newest.position)[:2], axis=1).min() < 0.3
     assert isinstance(last, pb.Prediction)
     assert {camera.camera for camera in last.cameras} == {c.name for c in SCENE.cameras}
+
+
+def test_people_of_whom_no_row_is_left_are_refused(traffic: Traffic, monkeypatch: pytest.MonkeyPatch) -> None:
+    hub = LiveHub()
+    for message in traffic.messages():
+        hub.handle(message)
+    monkeypatch.setattr("hub.tracking.calibration.people._matches_colour", lambda *_: False)
+    with pytest.raises(Refused, match="colours of the people are ambiguous"):
+        hub.stream.build(of_marker=False)
