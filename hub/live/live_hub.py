@@ -277,7 +277,7 @@ class LiveHub:
         ready = [name for name, rows in rows_by_camera.items() if rows >= self.settings.least_rows]
         film, least = self.stream.marker.film_s, min(_FILM_PER_CAMERA_S * len(cameras), LONG_FILM_S)
         if self.calibration is None and film < least:
-            return f"filmed for {film:.1f} s yet: {len(cameras)} cameras need {least:.1f} s"
+            return f"filmed for {film:.3g} s yet: {len(cameras)} cameras need {least:.3g} s"
         if len(ready) < 2 and self.stream.people.cameras:
             durations = {name: self.stream.people.seconds(name) for name in self.stream.people.cameras}
             if sum(seconds >= _MIN_PEOPLE_S for seconds in durations.values()) < 2:
