@@ -147,7 +147,7 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
 
     def keep(hub: LiveHub) -> None:
         if config.solve and known is None and hub.calibration is not None and hub.session is not None:
-            store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.links.delays)
+            store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.delays)
         note(hub)
 
     def note(hub: LiveHub) -> None:
@@ -173,7 +173,10 @@ def _export(hub: object, out: Path) -> str:
 
 
 def write_last(hub: object, out: Path) -> None:
-    """Write the hub's last calibration or refusal as the files that `calibrate` writes."""
+    """Write the hub's last calibration or refusal as the files that `calibrate` writes.
+
+    A refusal does not replace a calibration of before, as of a hub that was restarted while nothing moved.
+    """
     # Only here: with it comes the report, which costs a camera agent a fifth of a second of its start.
     from deploy.offline.outputs import report_refusal, report_result
     from hub.api import CalibrationResult
@@ -187,6 +190,8 @@ def write_last(hub: object, out: Path) -> None:
     session = Session(*hub.session)
     if hub.calibration is not None:
         report_result(CalibrationResult(on_present_clock(hub.calibration), session), out, "syncline hub")
+    elif hub.refusal is not None and (earlier := out / "calibration.toml").exists():
+        print(f"no answer: {hub.refusal.reason}; kept: {earlier}, of before")
     elif hub.refusal is not None:
         report_refusal(hub.refusal, session, out, "syncline hub")
 

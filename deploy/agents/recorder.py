@@ -6,7 +6,7 @@ import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from math import inf
@@ -22,7 +22,7 @@ from protocols.core.version import VERSION
 from protocols.log.write.rotation import RotatingWriter
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
-from protocols.topics import PICTURE, STATUS, TOPICS
+from protocols.topics import FLIGHT_IMAGE, PICTURE, STATUS, TOPICS, Topic
 from protocols.validation.rules import SCHEMA_VERSION
 
 ROLE = "record"
@@ -30,6 +30,8 @@ _TICK_S = 0.02  # between two looks at the bus: a queue holds seconds
 _SYNC_S = 0.5
 """Interval of fsync: half of the second that may be lost, because writing and the disk take time too."""
 _STATUS_S = 1.0  # as all agents: health counts 5 s without a status as dead
+_LAST_S = 3.0
+"""How long messages that had arrived by the end are written: 200,000 of them."""
 _MISSING_S = 2.0
 """How long a status names messages that went missing."""
 
@@ -106,15 +108,21 @@ def run_recorder(
                     if now >= next_status or full:
                         next_status = now + _STATUS_S - _SYNC_S / 2
                         counters = {**_counters(subscriptions, messages), "deleted_files": retention.deleted}
-                        _report(status, counters, missing.news(counters, now), full)
+                        _report(status, counters, missing.news(count_missing(subscriptions, wanted), now), full)
                         status.gauges.update({"log_bytes": writer.size, "disk_free_bytes": space.free_mb * 1e6})
                         publisher.put(status)
                         status.sequence += 1
                 beat()
                 if not full:
                     stop.wait(_TICK_S)
-            if not full:
-                messages += _record(writer, bus.site, subscriptions, limiter)
+            for subscription in subscriptions:
+                subscription.flush()
+            until = time.monotonic() + _LAST_S
+            # A queue gives so much at once.
+            while not full and (more := _record(writer, bus.site, subscriptions, limiter)):
+                messages += more
+                if time.monotonic() > until:
+                    break
             counters = _counters(subscriptions, messages)
         finally:
             publisher.close()
@@ -152,9 +160,8 @@ class MissingMessages:
     def __init__(self) -> None:
         self._total, self._until = 0, -inf
 
-    def news(self, counters: Mapping[str, int], now: float) -> int:
+    def news(self, total: int, now: float) -> int:
         """The number that is missing from the log if it has grown in the last seconds, else 0."""
-        total = sum(counters.get(name, 0) for name in ("dropped", "lost", "skipped"))
         if total > self._total:
             self._total, self._until = total, now + _MISSING_S
         return total if now < self._until else 0
@@ -198,6 +205,15 @@ def _counters(subscriptions: list[Subscription], messages: int) -> dict[str, int
         counts.update(subscription.counters)
     counts.pop("received", None)
     return {"recorded": messages, **counts}
+
+
+def count_missing(subscriptions: Sequence[Subscription], topics: Sequence[Topic]) -> int:
+    """Messages that should be in the log. Where only the newest counts, as of statuses, no older one is missed."""
+    return sum(
+        subscription.counters.get(name, 0)
+        for subscription, topic in zip(subscriptions, topics, strict=True)
+        for name in ("dropped", "lost", *(["skipped"] if topic is FLIGHT_IMAGE else []))
+    )
 
 
 def _report(status: pb.AgentStatus, counters: Mapping[str, int], missing: int, full: str) -> None:

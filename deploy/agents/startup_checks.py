@@ -24,6 +24,8 @@ _CERTIFICATE_S = 30.0
 _CLOCK_STEP_S = 2.0
 """A change of Unix time against the monotonic clock by more is a step: time services slew what is less."""
 _CLOCK_STEP_NOTICE_S = 60.0  # for so long a status names the step: long enough for a person to see it
+_MEETING_S = 2.0
+"""Time in which a peer that has just begun meets the others."""
 _MAX_TEXT = 2000  # characters of a status message
 _EXPIRY = "certificate_expiry_timestamp_s"
 
@@ -74,7 +76,9 @@ class Conditions:
     ) -> None:
         bus: BusConfig = settings.bus
         self._records = role_of(settings) == "record"
-        self._router = ", ".join(bus.endpoints()[0])
+        where = f" at {', '.join(bus.endpoints()[0])}" if bus.endpoints()[0] else ""
+        self._meeting_s = 0.0 if bus.mode == "client" else _MEETING_S
+        self._absent = f"no router{where}" if bus.mode == "client" else f"no other agent is reached{where}"
         self._certificate: Path | None = None if bus.tls is None else bus.tls.certificate
         self._connected, self._now, self._unix = connected, now, unix
         self._lost_at: float | None = None
@@ -98,7 +102,8 @@ class Conditions:
             return ""
         if self._lost_at is None:
             self._lost_at = self._now()
-        return f"no router at {self._router} for {self._now() - self._lost_at:.0f} s"
+        lost_s = self._now() - self._lost_at
+        return f"{self._absent} for {lost_s:.0f} s" if lost_s >= self._meeting_s else ""
 
     def _bad_clock(self) -> str:
         """Of a recorder, whose log is dated by this machine's clock; timing between cameras does not need it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,10 +10,13 @@ from typing import TYPE_CHECKING
 
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import printable
-from protocols.log.read.reader import LogReader
+from protocols.log.read.reader import LogReader, TopicSummary
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import OBSERVATION, STATUS
 
+_AT_ONCE = 1000
+"""Times a topic's usual rate: a hub publishes tracks of some hundred people, and what is faster was fetched."""
+_STEP_NS = 60 * NANOSECONDS  # between two frames: more than an outage from which a camera's are fetched
 _SHOWN = 100
 """Rows of a table; a file may hold 65,000 keys."""
 
@@ -24,8 +28,8 @@ if TYPE_CHECKING:
 class TopicDescription:
     """One key of the log. topic and agent are empty for a channel that is not in the catalogue.
 
-    rate_hz: mean message rate between the first and the last message, 0 for fewer than two. first_s, last_s: times of
-    these, since the start of the log.
+    rate_hz: mean message rate between the first and the last message, of observations by the cameras' own times; 0 for
+    fewer than two, and where a history arrived at once. first_s, last_s: arrival of these, since the start of the log.
     """
 
     key: str
@@ -81,6 +85,9 @@ class _Boot:
     detections: int = 0
     first: int = 2**64
     last: int = -1
+    time_ns: int | None = None
+    span_ns: int = 0
+    """Last device time, and between all of them, without steps of the clock"""
 
     def note(self, sequence: int) -> None:
         """An observation of this number was published."""
@@ -103,6 +110,11 @@ def describe_log(path: Path | str) -> LogDescription:
             boot.observations += 1
             boot.detections += len(message.detections)
             boot.note(message.sequence)
+            passed = message.device_time_ns - (boot.time_ns or message.device_time_ns)
+            boot.time_ns, boot.span_ns = (
+                message.device_time_ns,
+                boot.span_ns + (passed if abs(passed) < _STEP_NS else 0),
+            )
         elif isinstance(message, pb.AgentStatus) and message.role == "camera":
             numbered = round(message.counters["published"] + message.counters["unpublished"])
             if numbered:
@@ -121,7 +133,7 @@ def describe_log(path: Path | str) -> LogDescription:
                 topic=entry.address.topic.name if entry.address else "",
                 agent=entry.address.agent if entry.address else "",
                 count=entry.count,
-                rate_hz=_rate(entry.count, entry.last_ns - entry.first_ns),
+                rate_hz=_rate(entry, boots),
                 first_s=(entry.first_ns - summary.first_ns) / NANOSECONDS,
                 last_s=(entry.last_ns - summary.first_ns) / NANOSECONDS,
             )
@@ -186,5 +198,11 @@ def as_table(description: LogDescription) -> RenderableType:
     return Group(*parts)
 
 
-def _rate(count: int, span_ns: int) -> float:
-    return (count - 1) * NANOSECONDS / span_ns if count > 1 and span_ns > 0 else 0.0
+def _rate(entry: TopicSummary, boots: Mapping[tuple[str, str], _Boot]) -> float:
+    count, span_ns, topic = entry.count - 1, entry.last_ns - entry.first_ns, entry.address and entry.address.topic
+    if entry.address is not None and topic is OBSERVATION:
+        runs = [boot for (camera, _), boot in boots.items() if camera == entry.address.agent and boot.observations]
+        count = sum(boot.observations - 1 for boot in runs)
+        span_ns = sum(boot.span_ns for boot in runs)
+    rate = count * NANOSECONDS / span_ns if count > 0 and span_ns > 0 else 0.0
+    return 0.0 if topic and topic is not OBSERVATION and rate > _AT_ONCE * topic.rate_hz else rate

@@ -35,6 +35,7 @@ class Triangulation:
     """Trajectories on the reference clock, in the calibration's world and units.
 
     sigma_px: noise of one pixel coordinate by camera. unused: reasons by camera. unplaced: labels without trajectory.
+    contradicted: cameras of which there are rows, and which do not fit.
     """
 
     tables: tuple[TrajectoryTable, ...]
@@ -42,6 +43,7 @@ class Triangulation:
     unused: dict[str, str]
     unplaced: tuple[str, ...]
     warnings: tuple[str, ...]
+    contradicted: tuple[str, ...] = ()
 
 
 def triangulate(
@@ -108,6 +110,7 @@ def _triangulate(
         unused,
         tuple(label for label in observations.labels if label not in triangulated),
         tuple(warnings),
+        tuple(name for name in unused if name not in prepared.refused),
     )
 
 

@@ -33,6 +33,10 @@ from hub.clocks.delay_changepoint import (
 MIN_STEP_S = 0.2
 """Smaller steps cannot be distinguished from late frames [s]."""
 _STEP_SIGMAS = 5.0  # of what the frame numbers predict, whose period jitters: one in a million by chance
+_LONGEST_PAUSE_S = 3600.0
+"""Of a camera whose frames waited for the hub, so that no arrival shows whether it paused or its clock was set. A clock
+that is set for the first time, as of a board without a battery, steps by years."""
+_FETCHED_BINS = 4  # 2 s: more than the jitter of a link
 _USUAL_BINS = 8
 """4 s, of which the median is the usual delay: a frame from before a pause, in a bin of its own, does not change it"""
 _SCREENING_SIGMAS = 2.0
@@ -112,11 +116,20 @@ class ClockChangeDetector:
         self._changes: list[ClockChange] = []
 
     def handle(
-        self, camera: str, boot: str, sequence: int, frame: int, device_ns: int, arrival: float | None
+        self,
+        camera: str,
+        boot: str,
+        sequence: int,
+        frame: int,
+        device_ns: int,
+        arrival: float | None,
+        *,
+        waited: bool = False,
     ) -> tuple[str, ClockChange | None]:
         """Add one frame's time stamp; returns its clock segment, and the change if it begins a new one.
 
         device_ns: the frame's device time. arrival: time of arrival [s, one clock for all cameras]; None = not known.
+        waited: it waited for the hub, which will know more by the frames that come by themselves.
         """
         clock = self._clocks.get((camera, boot))
         if clock is None:
@@ -130,7 +143,7 @@ class ClockChangeDetector:
             name = next((name for first, name in reversed(clock.segments) if first <= sequence), boot)
             return name, None
         time = (device_ns - clock.origin_ns) * 1e-9  # Unix times in ns do not fit a float
-        change = self._detect_step(clock, camera, sequence, frame, time, arrival)
+        change = self._detect_step(clock, camera, sequence, frame, time, arrival, waited)
         clock.last = (sequence, frame, time, arrival)
         if change is None and arrival is not None and self._add_delay(clock, time, arrival):
             change = self._detect_drift(clock, camera, sequence, time)
@@ -158,7 +171,14 @@ class ClockChangeDetector:
         return fit_line(np.array(list(clock.bins)[:-1]))[1]
 
     def _detect_step(
-        self, clock: _ClockState, camera: str, sequence: int, frame: int, time: float, arrival: float | None
+        self,
+        clock: _ClockState,
+        camera: str,
+        sequence: int,
+        frame: int,
+        time: float,
+        arrival: float | None,
+        waited: bool,
     ) -> ClockChange | None:
         if clock.last is None:
             return None
@@ -182,8 +202,10 @@ class ClockChangeDetector:
             spread = max(1.5 * float(np.median(np.abs(np.array(clock.periods) - period))), 1e-4)
             # The error of the period, which is a median, grows with every frame that is missing.
             std = spread * math.hypot(math.sqrt(frames), frames * math.sqrt(0.5 * math.pi / len(clock.periods)))
-            if abs(step) < _STEP_SIGMAS * std or self._has_usual_delay(clock, time, arrival):
+            if abs(step) < _STEP_SIGMAS * std or self._has_usual_delay(clock, time, arrival, step):
                 return None
+            if 0.0 < step < _LONGEST_PAUSE_S and (waited or self._is_fetched(clock, last_time, arrival)):
+                return None  # as likely frames that the camera did not count
             earlier = list(clock.bins)[-1 - _MAX_PRESTEP_BINS : -1] if arrival is not None else []
             change = self._start_segment(clock, camera, "step", sequence, step, std)
             if len(earlier) >= _MIN_PRESTEP_BINS:
@@ -194,7 +216,7 @@ class ClockChangeDetector:
         return None
 
     @staticmethod
-    def _has_usual_delay(clock: _ClockState, time: float, arrival: float | None) -> bool:
+    def _has_usual_delay(clock: _ClockState, time: float, arrival: float | None, step: float) -> bool:
         """Whether both clocks have advanced: of a camera that stalled without counting frames, for one.
 
         By the last frame, and by the frames before that: of a machine that was suspended the last frame arrived late.
@@ -206,7 +228,17 @@ class ClockChangeDetector:
         usual = [last_arrival - last_time]
         if clock.bins:
             usual.append(float(np.median([delay for _, delay in list(clock.bins)[-_USUAL_BINS:]])))
-        return min(abs(arrival - time - delay) for delay in usual) < MIN_STEP_S
+        # A clock that is set forward makes frames seem earlier, never later.
+        earliest, latest = (-max(MIN_STEP_S, 0.5 * step), math.inf) if step > 0.0 else (-MIN_STEP_S, MIN_STEP_S)
+        return any(earliest < arrival - time - delay < latest for delay in usual)
+
+    @staticmethod
+    def _is_fetched(clock: _ClockState, time: float, arrival: float | None) -> bool:
+        """Whether the frames up to ``time`` came faster than they were filmed, as those fetched after an outage."""
+        if arrival is None or len(clock.bins) < _FETCHED_BINS:
+            return False
+        begin, delay = clock.bins[-_FETCHED_BINS]
+        return arrival - (begin + delay) < 0.5 * (time - begin)
 
     def _add_delay(self, clock: _ClockState, time: float, arrival: float) -> bool:
         """Add one delay; True when a bin is complete."""
@@ -271,7 +303,9 @@ class ClockChangeDetector:
         self._changes[refinement.change_index] = replace(change, rate_change=rate_change, step_s=step)
         if refinement.count >= _RATE_REFINEMENT_BINS:
             clock.refinement = None
-            if abs(refinement.slope_change) < _FALSE_ALARM_SHARE * abs(refinement.first_slope_change):
+            if abs(refinement.recent_slope) < _FALSE_ALARM_SHARE * abs(refinement.first_slope_change):
+                # The delays have changed, and the clock as little as another route changes it.
+                self._changes[refinement.change_index] = replace(change, rate_change=0.0, step_s=0.0)
                 for span in (WINDOW_BINS[0], WINDOW_BINS[-1]):
                     seen = clock.slope_power.get(span, 0.0)
                     clock.slope_power[span] = seen + _FALSE_ALARM_WEIGHT * (refinement.first_slope_change**2 - seen)

@@ -6,7 +6,8 @@ Each bin holds the frame with the lowest delay of half a second. Pure arithmetic
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -32,6 +33,7 @@ _MAX_RAMP_TO_STEP_MISFIT = 0.3
 """Largest ratio of the ramp's to the step's sum of squared residuals"""
 _PERSISTENT_LATE_BINS = 4
 """As many late bins in a row are taken as real, not as single delayed frames"""
+_RECENT_BINS = 20  # 10 s: half of those that refine a rate change
 _SMALL_SAMPLE_FACTOR = 1.2
 """A scatter from so few bins is sometimes underestimated"""
 
@@ -60,6 +62,13 @@ class RateChangeEstimator:
     sum_d: float = 0.0
     sum_td: float = 0.0
     late_in_a_row: int = 0
+    recent: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_RECENT_BINS))
+    """The last excess delays"""
+
+    @property
+    def recent_slope(self) -> float:
+        """Slope of the last excess delays by themselves: where the delay has changed and stays, there is none."""
+        return fit_line(np.array(self.recent))[1]
 
     def update(self, time: float, delay: float) -> None:
         """Add one bin and fit the line of the excess delays again."""
@@ -71,6 +80,7 @@ class RateChangeEstimator:
         if 0 < self.late_in_a_row < _PERSISTENT_LATE_BINS:
             excess = expected + margin
         time -= self.first_onset
+        self.recent.append((time, excess))
         self.count += 1
         self.sum_t += time
         self.sum_tt += time * time

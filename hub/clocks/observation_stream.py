@@ -64,7 +64,7 @@ class ObservationStream:
         arrival: on the hub's clock [s], None = unknown. backlog: it waited, so that its arrival says little.
         """
         time = self.clock_priors.times[message.camera] = message.device_time_ns / NANOSECONDS
-        message, change = self.clocks.assign(message, None if backlog else arrival)
+        message, change = self.clocks.assign(message, None if backlog else arrival, waited=backlog)
         if change is not None:
             self.marker.require_rows(change.segment, SEGMENT_MIN_ROWS)
             self._rate_changes.handle(change)

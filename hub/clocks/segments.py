@@ -39,24 +39,28 @@ class ClockSegments:
     def __init__(self) -> None:
         self._detector = ClockChangeDetector()
         self._runs: dict[str, str] = {}
-        self.alarms: dict[str, str] = {}
+        self._alarms: dict[str, str | ClockChange] = {}
         self._changes: Counter[str] = Counter()
 
-    def assign(self, message: pb.Observation, arrival: float | None) -> tuple[pb.Observation, ClockChange | None]:
-        """The observation with its clock segment as boot id, and the clock change that begins with it, if any."""
+    def assign(
+        self, message: pb.Observation, arrival: float | None, *, waited: bool = False
+    ) -> tuple[pb.Observation, ClockChange | None]:
+        """The observation with its clock segment as boot id, and the clock change that begins with it, if any.
+
+        arrival, waited: as of `ClockChangeDetector.handle`.
+        """
         camera, boot = message.camera, message.boot_id
         if self._changes.get(camera, 0) >= _MAX_CHANGES:
             return message, None
         segment, change = self._detector.handle(
-            camera, boot, message.sequence, message.frame, message.device_time_ns, arrival
+            camera, boot, message.sequence, message.frame, message.device_time_ns, arrival, waited=waited
         )
         self._runs[camera] = boot
         if change is not None:
             self._changes[camera] += 1
-        if change is not None and len(self.alarms) < _MAX_ALARMS:
-            step, ppm = f"stepped by {change.step_s:+.3f} s", f"drifts {1e6 * change.rate_change:+.0f} ppm"
-            text = step if change.kind == "step" else ppm
-            self.alarms[change.camera] = f"the clock of {change.camera} {text}"
+        if change is not None and len(self._alarms) < _MAX_ALARMS:
+            step = f"the clock of {camera} stepped by {change.step_s:+.3f} s"
+            self._alarms[camera] = step if change.kind == "step" else change
         if segment == boot:
             return message, change
         relabelled = pb.Observation()
@@ -64,10 +68,23 @@ class ClockSegments:
         relabelled.boot_id = segment
         return relabelled, change
 
+    @property
+    def alarms(self) -> dict[str, str]:
+        """By camera, its last step or rate change; none for a rate change that the seconds after did not confirm."""
+        out = {}
+        for camera, alarm in self._alarms.items():
+            if isinstance(alarm, str):
+                out[camera] = alarm
+                continue
+            rate = (self._detector.change_into(alarm.segment) or alarm).rate_change
+            if rate:
+                out[camera] = f"the clock of {camera} drifts {1e6 * rate:+.0f} ppm"
+        return out
+
     def report_step(self, camera: str, size: float) -> None:
         """Raise the alarm for a step [s] that the images show, smaller than one that the stamps would."""
-        if camera in self.alarms or len(self.alarms) < _MAX_ALARMS:
-            self.alarms[camera] = f"the clock of {camera} stepped by {size:+.3f} s"
+        if camera in self._alarms or len(self._alarms) < _MAX_ALARMS:
+            self._alarms[camera] = f"the clock of {camera} stepped by {size:+.3f} s"
 
     def to_present(
         self, calibration: Calibration, boots: Mapping[str, str], until: Mapping[str, str] | None = None
@@ -133,8 +150,10 @@ class RateChange:
 
     def refined(self, change: ClockChange | None) -> RateChange:
         """The same rate change in its present estimate ``change``; None = nothing new."""
-        if change is None or change.rate_change == 0.0:
+        if change is None:
             return self
+        if change.rate_change == 0.0:  # a false alarm
+            return replace(self, onset_s=self.detected_at_s, rate_change=0.0)
         onset = change.detected_at_s - change.step_s / change.rate_change
         return replace(self, onset_s=onset, rate_change=change.rate_change)
 

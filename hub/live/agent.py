@@ -47,8 +47,8 @@ _MESSAGES_S = 0.2
 """What the messages of a round may take together: tracks, and the status within 2 s, are published between rounds."""
 _BACKLOG_S = 2.0
 """After its start a hub gets what cameras had published before, all at once."""
-_FINISH_S = 20.0
-"""Longest wait for the last answer when the hub is stopped."""
+_FINISH_S, _FIRST_ANSWER_S = 5.0, 20.0
+"""Longest wait for the last answer when the hub is stopped, and where it has none yet: the last one was kept."""
 _PROGRESS_S = 2.0  # s: between two messages of progress
 _STATUS_S = 1.0  # s: between two statuses
 _RIG_S = 5.0  # s: between two looks at rig.toml
@@ -84,7 +84,7 @@ def run_hub(
         freeze_garbage_collector()
         while True:
             if stop.is_set() and finish_by is None:
-                finish_by = time.monotonic() + _FINISH_S
+                finish_by = running.stop()
             running.receive()
             running.obey(export)
             now = time.monotonic()
@@ -101,7 +101,7 @@ def run_hub(
             beat()
             if last:
                 break
-            if hub.calibration is None:
+            if hub.calibration is None and finish_by is None:
                 stop.wait(_TICK_S)  # nothing is published at the cameras' pace yet
             else:
                 time.sleep(_ROUND_S)
@@ -152,7 +152,7 @@ class _HubAgent:
         self._shedding = Shedding()
         self._began = self._now = time.monotonic()
         self._sequence, self._next_status, self._next_rig, self._next_progress = 0, 0.0, 0.0, 0.0
-        self._last_action = ""
+        self._last_action = self._stopping = ""
         self._publish(hub.tick(self._began))  # what comes now has not waited since the machine began
 
     def _publisher(self, topic: Topic, rate_hz: float | None = None) -> Publisher:
@@ -169,6 +169,14 @@ class _HubAgent:
         shard = self._shard
         for topic, message in [("", one) for one in messages] if shard is None else shard.outgoing(messages):
             self._publishers[topic or message.DESCRIPTOR.name].put(message)
+
+    def stop(self) -> float:
+        """Wait for missing messages no longer, and say so; returns until when the last answer is awaited."""
+        for subscription in self._subscriptions:
+            subscription.flush()
+        wait_s = _FIRST_ANSWER_S if self._hub.calibration is None else _FINISH_S
+        self._stopping, self._next_status = f"waits {wait_s:.0f} s at most for a last answer", 0.0
+        return time.monotonic() + wait_s
 
     def receive(self) -> None:
         """Take what has arrived."""
@@ -230,7 +238,10 @@ class _HubAgent:
             self._publish([rig_message(rig)])
         if now >= self._next_status or last:
             self._next_status = now + _STATUS_S
-            self._publish([self._status(now)])
+            status = self._status(now)
+            if self._stopping:
+                status.state, status.message = "stopping", "it was stopped" if last else self._stopping
+            self._publish([status])
             self._sequence += 1
 
     def _status(self, now: float) -> pb.AgentStatus:
@@ -248,7 +259,7 @@ class _HubAgent:
         behind = f"messages wait of {', '.join(shares.behind[:8])}" if shares.behind else ""
         advice = [one.text for one in hub.guidance.advice()] if needs_advice else []
         shared = "" if self._shard is None else self._shard.text()
-        texts = (shed, status.message, shared, behind, *advice, self._last_action)
+        texts = (shed, behind, status.message, shared, *advice, self._last_action)
         status.message = "; ".join(text for text in texts if text)[:_MAX_TEXT]
         return status
 
@@ -285,14 +296,17 @@ def status_message(
     message.gauges["silent_cameras"] = sum(age > SILENT_S for age in ages.values())
     if state in ("collecting", "searching"):
         # What is waited for, per camera: the search needs motion that two cameras see at the same time.
-        shared = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in hub.progress()[:_NAMED_CAMERAS]]
+        progress = [one for one in hub.progress() if one.shared_motion_s > 0.0 or not hub.stream.people.cameras]
+        shared = [f"{one.camera} {one.shared_motion_s:.0f} s" for one in progress[:_NAMED_CAMERAS]]
         message.message += f"; motion shared with another camera: {', '.join(shared)}" if shared else ""
     elif hub.calibration is not None and (left := set(hub.stream.marker.cameras) - hub.calibration.cameras.keys()):
         reasons = {one.camera: f" ({one.reason})" if one.reason else "" for one in hub.progress()}
+        # Not the reason again that degrades the hub.
+        reasons = {name: "" if why[2:-1] in message.message else why for name, why in reasons.items()}
         named = ", ".join(f"{name}{reasons.get(name, '')}" for name in sorted(left)[:_NAMED_CAMERAS])
         message.message += f"; heard but not calibrated: {named}"
     alarms = [*hub.stream.clocks.alarms.values(), *hub.clock_contradictions()]
-    message.message = "; ".join(filter(None, [*alarms, message.message, hub.unmatched(now)]))[:1000]
+    message.message = "; ".join(filter(None, [*alarms, hub.unmatched(now), message.message]))[:1000]
     _add_parts(message, hub, now)
     for counts in counters:
         for name, count in counts.items():

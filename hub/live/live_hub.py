@@ -107,6 +107,7 @@ class LiveHub:
         self.counters: Counter[str] = Counter()
         self.stream = ObservationStream(self.settings.window_s)
         self.links = CameraLinks()
+        self._earlier_delays: dict[str, float] = {}
         self._clock_stepped = False
         self.guidance = CoverageMonitor()
         self._known = known
@@ -255,6 +256,7 @@ class LiveHub:
         """
         if self._known is None and self.calibration is None:
             self._reloaded = ReloadedCalibration(calibration, dict(boot_ids), dict(delays), arrival)
+            self._earlier_delays = dict(delays)
 
     def clock_contradictions(self) -> list[str]:
         """Cameras whose external clock prior (NTP/PTP) the calibration contradicts, one line each."""
@@ -275,7 +277,7 @@ class LiveHub:
         ready = [name for name, rows in rows_by_camera.items() if rows >= self.settings.least_rows]
         film, least = self.stream.marker.film_s, min(_FILM_PER_CAMERA_S * len(cameras), LONG_FILM_S)
         if self.calibration is None and film < least:
-            return f"filmed for {film:.0f} s yet: {len(cameras)} cameras need {least:.0f} s"
+            return f"filmed for {film:.3g} s yet: {len(cameras)} cameras need {least:.3g} s"
         if len(ready) < 2 and self.stream.people.cameras:
             durations = {name: self.stream.people.seconds(name) for name in self.stream.people.cameras}
             if sum(seconds >= _MIN_PEOPLE_S for seconds in durations.values()) < 2:
@@ -337,6 +339,11 @@ class LiveHub:
         return dict(self._solved_boot_ids)
 
     @property
+    def delays(self) -> dict[str, float]:
+        """By camera, the last known delay [s] (`CameraLinks`), also of those not heard since this hub was started."""
+        return self._earlier_delays | self.links.delays
+
+    @property
     def unverified(self) -> bool:
         """Whether the present calibration was reloaded and not verified yet."""
         return self._reloaded is not None and self.calibration is not None
@@ -377,7 +384,7 @@ class LiveHub:
         ages = self.frame_ages(now)
         never = [] if self.calibration is None else [name for name in self.calibration.cameras if name not in ages]
         silent = [f"{name} ({age:.0f} s)" for name, age in ages.items() if age > SILENT_S]
-        silent += [f"{name} (never)" for name in never]
+        silent += [f"{name} (none since this hub was started)" for name in never]
         out += [f"no frames from {listed(silent)}"] if silent else []
         exceeding = self.budgets.exceeded(now, _BUDGET_NOTICE_S)
         if exceeding:
@@ -397,16 +404,18 @@ class LiveHub:
         tied = {} if self.calibration is None else self.calibration.cameras
         waiting = {} if self.calibration is None else self.calibration.refused
         out = []
-        shared = self.stream.marker.shared_motions_s()
+        shared, of_people = self.stream.marker.shared_motions_s(), not self._has_marker()
         for name in self.stream.marker.cameras:
             fault = self.links.standing.get(name) or self._pixel_faults.get(name)
             reason = fault or waiting.get(name, refused.get(name, ""))
-            rows, least = self.stream.marker.rows(name), self.settings.least_rows
+            rows, least, what = float(self.stream.marker.rows(name)), float(self.settings.least_rows), "detections"
+            if of_people:
+                rows, least, what = self.stream.people.seconds(name), _MIN_PEOPLE_S, "s of people"
             state = "searching" if rows >= least else "collecting"
             if not self.stream.has_info(name):
                 reason = "no CameraInfo yet: it holds the image size and the lens"
             elif state == "collecting" and not reason:
-                reason = f"{rows} of {least} detections"
+                reason = f"{rows:.0f} of {least:.0f} {what}"
             if name in tied:
                 silent = self._now - self.links.last_frame.get(name, self._now) > SILENT_S
                 state, reason = ("degraded", "no frames") if silent else ("calibrated", "")
@@ -454,10 +463,12 @@ class LiveHub:
         except Refused as refusal:
             self.refusal = refusal
             return []
-        except InputError as error:
-            # Invalid input is a camera's fault that must not stop the hub.
+        except Exception as error:  # noqa: BLE001 - whatever is wrong with the rows must not stop the hub
             self.counters["bad_sessions"] += 1
-            self.refusal = Refused(str(error))
+            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            self.refusal = Refused(f"{kind}{error}")
+            if self.calibration is not None:
+                self.solver_failure = self.refusal.reason
             return []
         self._schedule.readmit(now)
         left_out = self._schedule.left_out
@@ -535,10 +546,16 @@ class LiveHub:
         if self.calibration is None:
             return None
         then, found = self._in_present_segments(self.calibration, until=boots)
-        kept = {name: camera for name, camera in then.cameras.items() if found[name] == boots.get(name)}
+        # One that is not heard since this hub was started stays as it was reloaded.
+        kept = {
+            name: camera
+            for name, camera in then.cameras.items()
+            if found[name] == boots.get(name, self._solved_boot_ids.get(name))
+        }
+        heard = sum(name in boots for name in kept)
         # Most of a large network in one search cost less than a search for each of them.
-        begins_anew = len(boots) > LARGE_NETWORK and 2 * len(kept) < len(boots)
-        return replace(then, cameras=kept) if len(kept) > 1 and not begins_anew else None
+        begins_anew = len(boots) > LARGE_NETWORK and 2 * heard < len(boots)
+        return replace(then, cameras=kept) if heard > 1 and not begins_anew else None
 
     def _take(self, answer: SolverAnswer, now: float) -> list[Message]:
         """Use an answer: the calibration that it gives, or why there is none."""
@@ -587,11 +604,15 @@ class LiveHub:
         self._reloaded = None
         self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
         self.session = job.rig, job.observations
+        if unheard := found.cameras.keys() - job.rig.cameras.keys():
+            why = f"{listed(sorted(unheard))}: pose and clock are of before the hub was started, not heard since"
+            found = replace(found, warnings=(*found.warnings, why))
         if job.last is None and self.calibration is not None and self.tracking is not None and not self.is_shard:
             self.tracking = LiveTracking()  # in another world frame
         self._report_steps(found)
         self.calibration, self.calibrated_at = found, now
-        self._solved_boot_ids = {name: boots[name] for name in found.cameras if name in boots}
+        known = self._solved_boot_ids | boots
+        self._solved_boot_ids = {name: known[name] for name in found.cameras if name in known}
         return [event, *self._publish_present()]
 
     def _report_steps(self, found: Calibration) -> None:
@@ -651,7 +672,8 @@ class LiveHub:
         if found is None:
             return []
         self.calibration = found
-        self._solved_boot_ids = {name: boots[name] for name in found.cameras}
+        known = dict(reloaded.boots) | boots
+        self._solved_boot_ids = {name: known[name] for name in found.cameras}
         return self._publish_present()
 
     def _has_marker(self) -> bool:

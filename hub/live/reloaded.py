@@ -36,10 +36,14 @@ class ReloadedCalibration:
     _heard_two_at: float = np.inf
 
     def on_present_clocks(self, boots: Mapping[str, str], links: CameraLinks, now: float) -> Calibration | None:
-        """The answer with the cameras that are heard of, as soon as those are two; boots: of the cameras now."""
+        """The answer as soon as two of its cameras are heard of; boots: of the cameras now.
+
+        Without those that are heard on a clock that it does not know; those not heard of are as they were.
+        """
         last = self.calibration
         heard = {name: last.cameras[name] for name in boots if name in last.cameras and name in links.delays}
         shifts = {name: links.delays[name] - self.delays.get(name, -np.inf) for name in heard}
+        unheard = {name: one for name, one in last.cameras.items() if name not in boots and name in self.boots}
         kept = {
             name: camera
             for name, camera in heard.items()
@@ -63,18 +67,25 @@ class ReloadedCalibration:
                 )
                 for name, camera in fresh.items()
             }
-            self.calibration = replace(last, cameras=kept)
+            # The reference clock began anew, the clocks of those that are not heard did not, as far as is known.
+            unheard = {
+                name: on_new_clock(one, -shifts[last.reference], then=one.lag_time, now=one.lag_time)
+                for name, one in unheard.items()
+            }
+            self.calibration = replace(last, cameras=kept | unheard)
         if len(kept) < 2:
             return None  # not heard of yet, a backlog, or clocks that it does not know
         self.since = now
-        return replace(self.calibration, cameras=kept)
+        return replace(self.calibration, cameras=kept | unheard)
 
     def on_clocks(self, boots: Mapping[str, str]) -> Calibration:
-        """The cameras that rows can verify. boots: of the rows' cameras, which need not be all that it has."""
-        cameras = self.calibration.cameras
-        if self.arrival is None:
-            cameras = {name: one for name, one in cameras.items() if self.boots.get(name) == boots.get(name)}
-        return replace(self.calibration, cameras={name: one for name, one in cameras.items() if name in boots})
+        """Without the cameras on a clock that it does not know. boots: of those that are heard of."""
+        known = {
+            name: one
+            for name, one in self.calibration.cameras.items()
+            if name not in boots or self.arrival is not None or self.boots.get(name) == boots[name]
+        }
+        return replace(self.calibration, cameras=known)
 
     def has_failed(self, now: float) -> bool:
         """Whether new rows did not verify it in time."""

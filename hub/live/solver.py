@@ -151,8 +151,9 @@ def run_job(job: SolverJob, cpu_clock: Callable[[], float] = time.process_time) 
 def _verified(job: SolverJob) -> Calibration:
     """The last answer without the cameras that the rows contradict. Raises Refused where they contradict all of it."""
     assert job.last is not None
-    found = triangulate(job.rig, job.last.cameras, job.observations)
-    kept = {name: camera for name, camera in job.last.cameras.items() if name in found.sigma_px}
+    heard = {name: camera for name, camera in job.last.cameras.items() if name in job.rig.cameras}
+    found = triangulate(job.rig, heard, job.observations)
+    kept = {name: camera for name, camera in job.last.cameras.items() if name not in found.contradicted}
     return Calibration(
         kept,
         job.last.reference,
@@ -160,7 +161,7 @@ def _verified(job: SolverJob) -> Calibration:
         job.last.units,
         job.last.solver,
         job.last.version,
-        refused=dict(found.unused),
+        refused={name: found.unused[name] for name in found.contradicted},
         warnings=found.warnings,
     )
 

@@ -33,7 +33,7 @@ def lag_charts(state: ViewState, now: float) -> str:
     strips = [
         _strip(state.cameras[name], found, start, moment, solved is not None and name == solved.reference_camera)
         for name, found in samples.items()
-        if found
+        if found and state.cameras[name].calibration is not None
     ]
     if not strips:
         strips = ["<p>Lags appear with the first calibration.</p>"]

@@ -34,7 +34,7 @@ _STYLE = (
     ".sl th{text-align:right;font-weight:600;padding:1px 4px;border-bottom:1px solid #888;white-space:nowrap}"
     ".sl td{text-align:right;padding:1px 4px;white-space:nowrap}"
     ".sl td:first-child,.sl th:first-child{text-align:left;white-space:normal;overflow-wrap:anywhere}"
-    ".sl .clock td{white-space:normal;padding:0 4px 3px 1.6em;color:#444}"
+    ".sl th:first-child{min-width:5em}.sl .clock td{white-space:normal;padding:0 4px 3px 1.6em;color:#444}"
     ".sl .bad{font-weight:700}.sl p{margin:.35em 0}.sl .grid{font-family:monospace;line-height:1;white-space:pre}"
     ".sl .headline{font-size:15px}.sl .tiles{display:grid;grid-template-columns:repeat(auto-fill,minmax(130px,1fr));"
     "gap:6px}.sl figure{margin:0}.sl .frame{position:relative;background:#e8e8e8;aspect-ratio:4/3;display:flex;"
@@ -51,7 +51,8 @@ def overview(state: ViewState, now: float) -> str:
     headline = f"<b class='headline'>{html.escape(word)}</b>{html.escape(colon + rest)}"
     lines = [f"<p data-syncline='headline' data-hub='{html.escape(state.hub_state, quote=True)}'>{headline}"]
     if problems := state.problems(now):
-        lines.append(f"<br><b data-syncline='health'>▲ degraded: {html.escape('; '.join(problems))}</b>")
+        listed = "<br>▲ ".join(html.escape(problem) for problem in problems)
+        lines.append(f"<br><b data-syncline='health'>▲ degraded: {listed}</b>")
     lines.append("</p>")
     if needs_guidance(state):
         lines += [f"<p data-syncline='guide'>☞ {html.escape(step)}</p>" for step in state.next_steps()]
@@ -76,7 +77,7 @@ def waiting_html(state: ViewState) -> str:
     for camera in state.cameras.values():
         progress, share = camera.progress, state.guidance.coverage(camera.name)
         parts = [camera.reason[:120]] if camera.reason else []
-        if progress is not None:
+        if progress is not None and (progress.shared_motion_s > 0.0 or state.guidance.target != "person"):
             parts.append(f"{progress.shared_motion_s:.0f} s of motion shared with another camera")
         wanted = f"{100 * MIN_COVERAGE:.0f} % wanted"
         parts.append(f"{state.guidance.target} seen in {100 * share:.0f} % of its view, {wanted}")

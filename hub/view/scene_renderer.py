@@ -193,7 +193,7 @@ class SceneRenderer:
             self._labels[name].position = position + 0.25 * scale * _up({name: pose})
             self.frusta_moved += 1
         std_ms = 1e3 * found.time_offset_std
-        sharp = f"± {std_ms:.2g} ms" if std_ms > 0.0 else "reference clock"
+        sharp = f"± {std_ms:.2g} ms" if std_ms > 0.0 else "" if found.time_offset else "reference clock"
         text = f"{SIGNS[status]} {name}  {sharp if status == 'calibrated' else status}"
         if self._drawn.get(f"text {name}") != text:
             self._drawn[f"text {name}"] = text

@@ -6,6 +6,7 @@ No sockets, no clock and no browser code: the same state is shown live and in re
 from __future__ import annotations
 
 import itertools
+import re
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Literal
@@ -34,6 +35,7 @@ _MAX_PATHS = 48  # tracked people get new labels: the track not updated for long
 _MAX_PROBLEMS = 3  # in the headline
 _MAX_ALARM = 300  # characters of the status of an agent that is still starting
 
+_CALIBRATED = re.compile(r"(?:^|; )\d+ cameras calibrated")
 CameraState = Literal["calibrated", "degraded", "searching", "collecting", "refused", "silent", "gone"]
 """The hub's word for a camera, or that no frames come."""
 _WORDS: dict[str, CameraState] = {
@@ -222,8 +224,8 @@ class ViewState:
                 self._uav(agent)
             elif agent in self.uavs and self.uavs[agent].boot in ("", boot):
                 del self.uavs[agent]
-        elif not alive and agent in self.agents and self.agents[agent].status.boot_id == boot:
-            self.agents[agent].alive = False
+        elif agent in self.agents and self.agents[agent].status.boot_id == boot:
+            self.agents[agent].alive = alive
 
     def of_role(self, role: str) -> list[AgentView]:
         """The running agents of a role, by name."""
@@ -266,8 +268,12 @@ class ViewState:
             if not agent.alive:
                 if not self.of_role(role):
                     out.append(f"{name} has ended" + (f": {status.message}" if status.state == "stopping" else ""))
+            elif status.state == "stopping" and role == "hub":
+                out.append(f"{name} is being stopped: {status.message}")
             elif status.state == "degraded" or (status.state == "stopping" and role == "record"):
-                out.append(f"{name}: {status.message or status.state}")
+                # What comes after a hub's number of cameras is in their rows and in the advice.
+                text = _CALIBRATED.split(status.message)[0] if role == "hub" else status.message
+                out.append(f"{name}: {text or status.message or status.state}")
             elif status.counters.get("alarms"):  # they come first; a hub that waits says much else
                 out.append(f"{name}: {status.message[:_MAX_ALARM]}")
             elif role != "camera" and now - agent.at > STALE_S:
@@ -326,6 +332,8 @@ class ViewState:
         """Process the status of a camera, hub or recorder."""
         before, agent = self.agents.get(message.agent), AgentView(message, now, since=now)
         if before is not None:
+            # Its last status may be read after it was seen to end.
+            agent.alive = before.alive or before.status.boot_id != message.boot_id
             agent.change_seen = before.recording != agent.recording
             if not agent.change_seen:
                 agent.since, agent.change_seen = before.since, before.change_seen

@@ -98,6 +98,9 @@ class Subscription(Protocol):
     def refusals(self) -> list[Refusal]:
         """The messages rejected since the last call, a bounded number of them: the counters include all."""
 
+    def flush(self) -> None:
+        """Queue what is held back until missing messages before it arrive; those count as lost."""
+
     def close(self) -> None:
         """Stop receiving; queued messages can still be drained."""
 

@@ -43,7 +43,7 @@ class AcceptanceTest:
 
 @dataclass(frozen=True, slots=True)
 class PrecisionTest(AcceptanceTest):
-    """Of a std: where it fails, the observations do not refute the estimate, but say too little."""
+    """Of a std or a number of rows: where it fails, the observations say too little, but do not refute the estimate."""
 
 
 def first_failure(tests: Iterable[AcceptanceTest]) -> AcceptanceTest | None:

@@ -213,6 +213,8 @@ def gather_columns(
 
     frames_may_repeat: repeated frame numbers are a warning, as from cameras that nobody can correct.
     """
+    if not len(c):
+        return Observations({})
     sorting = np.lexsort((frame, time, k, c))
     c, k, frame, time, pixels, size = (
         c[sorting],

@@ -130,14 +130,15 @@ def _with_bus(settings: Any, start: Any) -> int:
 
 
 def _progress_lines(seen: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Passes statuses on; of an agent that is starting, prints every few seconds what it waits for."""
+    """Passes statuses on; prints what an agent that ends waits for, and every few seconds what one that starts does."""
     printed, text = -_PROGRESS_S, ""
 
     def show(status: Any) -> None:
         nonlocal printed, text
         seen(status)
         now = time.monotonic()
-        if status.state == "starting" and status.message != text and now - printed >= _PROGRESS_S:
+        waits = status.state == "starting" and now - printed >= _PROGRESS_S
+        if status.message != text and (waits or (status.state == "stopping" and status.role == "hub")):
             printed, text = now, status.message
             print(text, flush=True)
 

@@ -155,6 +155,10 @@ class SenderCheckedSubscription:
         counts["received"] -= sum(self._refused.values())
         return counts
 
+    def flush(self) -> None:
+        """Queue what is held back."""
+        self._inner.flush()
+
     def ignore(self, agents: Set[str]) -> None:
         """Drop what these agents send."""
         self._inner.ignore(agents)

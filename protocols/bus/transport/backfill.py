@@ -233,6 +233,13 @@ class Backfill(Generic[_Source]):
         for question in queries:
             self._ask(question)
 
+    def flush(self) -> None:
+        """Deliver all that is held back; what is missing counts as lost."""
+        with self._lock:
+            for who in list(self._held):
+                while who in self._held:
+                    self._release(who)
+
     def _out_of_sequence(
         self, who: tuple[str, _Source], expected: int | None, number: int, payload: bytes
     ) -> RecoveryQuery[_Source] | None:

@@ -265,6 +265,9 @@ class InboxSubscription:
         """See the contract."""
         return self.inbox.counters
 
+    def flush(self) -> None:
+        """Nothing is held back, unless the transport recovers what is missing."""
+
     def ignore(self, agents: Set[str]) -> None:
         """Drop what these agents send."""
         self.inbox.ignore(agents)

@@ -411,6 +411,13 @@ class ZenohSubscription(InboxSubscription):
         with self._turn:
             return super().drain()
 
+    def flush(self) -> None:
+        """Queue what was fetched and what waits for it."""
+        if self._open_histories:
+            self._read_histories()
+        self._backfill.flush()
+        self.inbox.push_all(self._arrived)
+
     def close(self) -> None:
         """Undeclare: a process with an open subscription never exits."""
         undeclare_all(self._publishers, self._heartbeats, self._subscriber)
@@ -446,10 +453,10 @@ class ZenohBus(Closing):
         site: str,
         clock_ns: Callable[[], int],
         outage_s: float,
-        needs_router: bool = False,
+        needs_others: bool = False,
     ) -> None:
         self._session = session
-        self._needs_router = needs_router
+        self._needs_others = needs_others
         self._had_others = self._has_lost_others = False
         self._site = check_identifier(site, "site")
         self._clock_ns = clock_ns
@@ -495,16 +502,15 @@ class ZenohBus(Closing):
         return watch
 
     def connected(self) -> bool:
-        """Whether this process can reach others: a client without its router cannot, nor a peer that lost all others.
-
-        A peer that has met nobody yet may be the first.
+        """Whether this process can reach others: a client without its router cannot, nor a peer that lost all others or
+        meets nobody where it is told to connect. Another peer that has met nobody yet may be the first.
         """
         with zenoh_call("routers"):
             info = self._session.info
             others = bool(info.routers_zid() or info.peers_zid())
         self._has_lost_others = not others and (self._has_lost_others or self._had_others)
         self._had_others = others
-        return others or not (self._needs_router or self._has_lost_others)
+        return others or not (self._needs_others or self._has_lost_others)
 
     def close(self) -> None:
         """Undeclare everything and close the session."""
@@ -529,4 +535,10 @@ def open_bus(
     check_identifier(site, "site")
     config = config or BusConfig()
     session = open_session(config, stop=stop, timeout_s=timeout_s)
-    return ZenohBus(session, site, time.time_ns, config.outage_s, needs_router=config.mode == "client")
+    return ZenohBus(
+        session,
+        site,
+        time.time_ns,
+        config.outage_s,
+        needs_others=config.mode == "client" or (config.mode == "peer" and bool(config.connect)),
+    )

@@ -22,6 +22,8 @@ def test_a_client_knows_whether_it_reaches_its_router() -> None:
 def test_others_are_connected_while_they_are_open() -> None:
     with open_bus("local", BusConfig(multicast=False)) as peer:
         assert peer.connected()
+    with open_bus("local", BusConfig(connect=(free_endpoint(),))) as misled:
+        assert not misled.connected(), "the address is another's, or wrong"
     with MemoryBus(MemoryHub()) as memory:
         assert memory.connected()
     assert not memory.connected()

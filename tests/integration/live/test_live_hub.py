@@ -493,6 +493,26 @@ def test_more_rows_replace_an_answer_whatever_their_stds_and_the_session_is_the_
     assert len(hub.session[1]) > 1.5 * rows
 
 
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_rows_that_cannot_be_put_together_do_not_end_the_hub(
+    session: Session, calibrated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """People whose colours matched nobody gave no row at all, and the hub ended with a traceback."""
+    hub, stream = LiveHub(SETTINGS), messages(session)
+    feed(hub, stream[:-200] if calibrated else [])
+
+    def fails(of_marker: bool) -> None:
+        raise IndexError("out of bounds")
+
+    monkeypatch.setattr(hub.stream, "build", fails)
+    for message in stream if not calibrated else stream[-200:]:
+        hub.handle(message)
+    hub.tick(2e6)
+    assert hub.counters["bad_sessions"] == 1
+    assert "IndexError: out of bounds" in hub.state(2e6)[1]
+    assert (hub.calibration is not None) == calibrated
+
+
 def test_a_last_job_searches_for_every_camera_that_is_not_tied(session: Session) -> None:
     """A hub that is stopped soon after a search must not leave a camera out that waits for the next one."""
     hub = LiveHub(SETTINGS)

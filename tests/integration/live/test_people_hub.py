@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +14,13 @@ from deploy.cli import run
 from deploy.demo.people import score_log
 from deploy.simulation.session import camera_tables
 from edge import scenes
-from hub.live.agent import run_hub
+from hub.live.agent import run_hub, status_message
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
@@ -26,7 +28,7 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import read_calibration
 from protocols.topics import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
 from tests.support.people_traffic import Traffic, film
-from tests.support.samples import eventually
+from tests.support.samples import camera_info, eventually
 from tests.support.threads import running
 
 SCENE = scenes.get_people_scene(21, 4, 3)
@@ -88,6 +90,19 @@ def test_a_replayed_log_tracks_everybody_with_equal_bytes(log: Path, known: Path
     assert any(target.face for message in heads for camera in message.cameras for target in camera.targets)  # type: ignore[attr-defined]
 
 
+def test_what_is_waited_for_of_people_is_said_of_people(traffic: Traffic) -> None:
+    """The page said `0 of 90 detections` of cameras that each saw four people."""
+    hub = LiveHub()
+    for message in traffic.messages():
+        hub.handle(message)
+    for name in hub.stream.people.cameras:
+        hub.handle(camera_info(name))
+    assert all(re.fullmatch(r"[1-9]\d* of 40 s of people", one.reason) for one in hub.progress()), hub.progress()
+    status = status_message(hub, "hub", "boot", 0, [])
+    assert "observed too briefly yet" in status.message
+    assert "motion shared" not in status.message
+
+
 @pytest.mark.parametrize(("stated", "up"), [(np.array([0.0, -2.0, 0.0]), [0, -1, 0]), (None, None)])
 def test_up_is_where_a_known_calibration_states_it(known: Path, stated: Floats | None, up: list[float] | None) -> None:
     """Of one whose world has y down people were tracked as if z were up."""
@@ -140,3 +155,12 @@ def test_tracks_and_predictions_come_over_the_bus(traffic: Traffic, known: Path)
     assert np.linalg.norm(truth[:, :2] - np.array(newest.position)[:2], axis=1).min() < 0.3
     assert isinstance(last, pb.Prediction)
     assert {camera.camera for camera in last.cameras} == {c.name for c in SCENE.cameras}
+
+
+def test_people_of_whom_no_row_is_left_are_refused(traffic: Traffic, monkeypatch: pytest.MonkeyPatch) -> None:
+    hub = LiveHub()
+    for message in traffic.messages():
+        hub.handle(message)
+    monkeypatch.setattr("hub.tracking.calibration.people._matches_colour", lambda *_: False)
+    with pytest.raises(Refused, match="colours of the people are ambiguous"):
+        hub.stream.build(of_marker=False)

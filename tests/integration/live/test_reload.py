@@ -11,10 +11,12 @@ import pytest
 from google.protobuf.message import Message
 
 from deploy.agents.answer_store import HISTORY, LAST, AnswerStore
+from deploy.agents.assembly import write_last
 from hub.live.live_hub import LiveHub, LiveSettings
 from hub.live.scheduled_hub import ScheduledHub
 from hub.live.solver import SolverJob
 from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.core.errors import Refused
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import read_calibration
@@ -112,23 +114,79 @@ def test_a_replay_of_the_log_verifies_the_reloaded_answer_too(session: Session, 
     assert [maps(one) for one in out[-len(verified) :]] == [pytest.approx(maps(one), rel=1e-12) for one in verified]
 
 
-@pytest.mark.parametrize("change", ["gone", "restarted"])
-def test_without_one_of_its_cameras_the_others_verify_it(session: Session, kept: Path, change: str) -> None:
-    """Behind a link that is cut, nothing is heard of a camera; a restarted one has another clock."""
+def without(hub: LiveHub, camera: str) -> None:
+    """Nothing of that camera reaches the hub, as behind a link that is cut."""
+    handle = hub.handle
+    hub.handle = lambda message, *more: None if getattr(message, "camera", "") == camera else handle(message, *more)  # type: ignore[method-assign,assignment]
+
+
+def test_a_restarted_camera_is_left_out_of_what_the_others_verify(session: Session, kept: Path) -> None:
     hub = restarted(kept)
-    reloaded = hub._reloaded
-    assert reloaded is not None
-    if change == "gone":
-        camera = reloaded.calibration.cameras["cam1"]
-        cameras = {**reloaded.calibration.cameras, "gone": camera}
-        reloaded.calibration = dataclasses.replace(reloaded.calibration, cameras=cameras)
-    else:
-        reloaded.boots = {**reloaded.boots, "cam1": "before"}
+    assert hub._reloaded is not None
+    hub._reloaded.boots = {**hub._reloaded.boots, "cam1": "before"}
     play(hub, session, 18.0, 22.0)
     assert (hub.counters["solver_failures"], hub.counters["verified"]) == (0, 1)
     assert hub.state(22.0)[0] == "calibrated"
     assert hub.calibration is not None
-    assert set(hub.calibration.cameras) == ({"cam0", "cam1", "cam2"} if change == "gone" else {"cam0", "cam2"})
+    assert set(hub.calibration.cameras) == {"cam0", "cam2"}
+
+
+def test_a_camera_that_is_not_heard_keeps_its_pose_over_two_restarts(
+    session: Session, kept: Path, tmp_path: Path
+) -> None:
+    """The first answer after a restart replaced calibration.toml, without the camera behind the cut link."""
+    before = AnswerStore(kept).load()
+    assert before is not None
+    hub = restarted(kept)
+    without(hub, "cam1")
+    play(hub, session, 14.0, 20.0)
+    assert (hub.counters["verified"], hub.results > 0, hub.counters["solver_failures"]) == (1, True, 0)
+    assert hub.calibration is not None
+    assert hub.session is not None
+    assert any("cam1" in warning for warning in hub.calibration.warnings)
+    assert hub.state(20.0)[1] == "no frames from cam1 (none since this hub was started); 3 cameras calibrated"
+    store = AnswerStore(tmp_path, copy=tmp_path / "calibration.toml")
+    store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.delays)
+    store.close()
+    write_last(hub, tmp_path)
+    for file in ("calibration.toml", "current.toml"):
+        pose = read_calibration(tmp_path / file)[1]["cam1"].pose
+        assert pose.position == pytest.approx(before[0].cameras["cam1"].pose.position, abs=1e-9)
+
+    again = restarted(tmp_path)
+    play(again, session, 20.0, 24.0)
+    assert again.counters["verified"] == 1
+    assert again.state(24.0)[0] == "calibrated"
+    assert again.calibration is not None
+    clock = again.calibration.cameras["cam1"].time_map
+    assert abs(session.clock_error("cam1", again.calibration.reference, clock)) < 1e-3
+
+
+def test_a_camera_that_comes_back_goes_on_from_its_pose(session: Session, kept: Path) -> None:
+    hub = restarted(kept)
+    without(hub, "cam1")
+    play(hub, session, 12.0, 18.0)
+    del hub.handle
+    play(hub, session, 18.0, 24.0)
+    assert hub.calibration is not None
+    assert hub.calibration.warnings == ()
+    assert hub.state(24.0) == ("calibrated", "3 cameras calibrated")
+    clock = hub.calibration.cameras["cam1"].time_map
+    assert abs(session.clock_error("cam1", hub.calibration.reference, clock)) < 1e-3
+
+
+def test_a_hub_that_finds_nothing_after_its_restart_keeps_the_files_of_before(
+    session: Session, kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was stopped before anything moved, and calibration.toml was removed."""
+    file = tmp_path / "calibration.toml"
+    file.write_bytes((kept / LAST).read_bytes())
+    hub = LiveHub(SETTINGS)
+    hub.session, hub.refusal = (session.rig, session.observations()), Refused("the point hardly moves")
+    write_last(hub, tmp_path)
+    assert file.read_bytes() == (kept / LAST).read_bytes()
+    assert f"no answer: the point hardly moves; kept: {file}, of before" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_where_the_solver_fails_a_reloaded_answer_is_dropped_in_time(

@@ -30,7 +30,7 @@ from protocols.core.errors import InputError
 from protocols.log.read.reader import LogMessage, LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
-from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE, STATUS, TOPICS
+from protocols.topics import CAMERA_INFO, OBSERVATION, PICTURE, STATUS, TOPICS, TRACK
 from tests.support.samples import SAMPLES, camera_info, eventually, observation
 from tests.support.threads import running
 
@@ -274,7 +274,7 @@ def test_a_log_is_described_with_what_is_missing(tmp_path: Path) -> None:
     description = describe_log(path)
     (topic,) = description.topics
     assert (topic.topic, topic.agent, topic.count, topic.last_s) == ("observation", "cam0", 8, 5.0)
-    assert topic.rate_hz == pytest.approx(7 / 5)
+    assert topic.rate_hz == pytest.approx(30 * 3 / 5), "of the cameras' own times: 4 of 6 frames at 30 Hz"
     assert [(camera.boot_id, camera.observations, camera.missing) for camera in description.cameras] == [
         ("boot-1", 4, 2),
         ("boot-2", 4, 2),
@@ -304,6 +304,19 @@ def test_what_a_camera_says_that_it_published_is_missing_too(tmp_path: Path) -> 
         log.write(STATUS, "hub", "local", hub, 9 * SECOND)
     missing = [(camera.camera, camera.observations, camera.missing) for camera in describe_log(path).cameras]
     assert missing == [("cam0", 4, 6), ("cam1", 0, 4)]
+
+
+def test_what_was_fetched_at_once_has_the_rate_of_its_cameras(tmp_path: Path) -> None:
+    """A history's messages arrive within microseconds: 2,000,000 Hz. A step of the clock is no time that passed."""
+    path = tmp_path / "a.mcap"
+    with LogWriter(path) as log:
+        for index in range(300):
+            message = observation("cam0", index, "boot-1")
+            message.device_time_ns += 5000 * SECOND if index >= 150 else 0
+            log.write(OBSERVATION, "cam0", "local", message, SECOND + 500 * index)
+            log.write(TRACK, "hub", "local", pb.Track(schema_version=1, label="marker"), SECOND + 500 * index)
+    rates = {one.topic: one.rate_hz for one in describe_log(path).topics}
+    assert rates == {"observation": pytest.approx(30.0, rel=0.01), "track": 0.0}
 
 
 def test_the_table_shows_damage_and_counts(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from deploy.agents import recorder_commands
-from deploy.agents.recorder import RecorderResult, run_recorder
+from deploy.agents.recorder import RecorderResult, count_missing, run_recorder
 from deploy.agents.recorder_commands import record_on_command
 from deploy.agents.retention import Retention, Space, free_bytes, unused_log_path
 from deploy.cli import run
@@ -30,7 +30,7 @@ from protocols.log.read.reader import LogReader
 from protocols.log.read.recovery import recover
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
-from protocols.topics import OBSERVATION, STATUS
+from protocols.topics import FLIGHT_IMAGE, OBSERVATION, STATUS
 from tests.integration.logs.test_record_replay import RECORDER
 from tests.support.samples import eventually, observation
 from tests.support.threads import running
@@ -58,6 +58,31 @@ def test_recording_ends_with_a_complete_log_before_the_disk_is_full(tmp_path: Pa
     reader = LogReader(result.path)
     assert [item.topic for item in reader.messages()][:1] == [OBSERVATION]
     assert reader.damage == ""
+
+
+def test_all_that_has_arrived_when_it_is_stopped_is_in_the_log(tmp_path: Path) -> None:
+    """A queue gives 4,096 messages at once, and the rest of a fetched history was not written."""
+    hub, stop = MemoryHub(), threading.Event()
+    with MemoryBus(hub) as sending, MemoryBus(hub) as bus:
+        camera = sending.publisher(OBSERVATION, "cam0")
+
+        def send_and_stop() -> None:
+            for number in range(10_000):
+                camera.put(observation("cam0", number))
+            stop.set()
+
+        result = run_recorder(RecorderConfig(out=tmp_path / "a.mcap"), bus, stop, beat=send_and_stop)
+    assert sum(item.topic is OBSERVATION for item in LogReader(result.path).messages()) == 10_000
+
+
+def test_older_statuses_are_not_missed_but_images_of_a_flight_are() -> None:
+    """Of statuses only the newest counts: over a slow link the recorder was degraded for them."""
+    bus, topics = MemoryBus(MemoryHub()), (OBSERVATION, STATUS, FLIGHT_IMAGE)
+    subscriptions = [bus.subscribe(topic) for topic in topics]
+    for subscription, (lost, skipped) in zip(subscriptions, ((2, 0), (0, 50), (0, 7)), strict=True):
+        subscription.inbox.count_lost(lost)
+        subscription.inbox.count_skipped(skipped)
+    assert count_missing(subscriptions, topics) == 9
 
 
 def test_a_recording_does_not_start_on_a_full_disk(tmp_path: Path) -> None:

@@ -48,6 +48,21 @@ def test_a_lost_router_is_a_reason_with_its_duration_until_it_is_back() -> None:
     assert machine.status().state == "running"
 
 
+@pytest.mark.parametrize(
+    ("bus", "text"),
+    [
+        (BusConfig(connect=("tcp/127.0.0.1:9",)), "no other agent is reached at tcp/127.0.0.1:9 for 7 s; 12 messages"),
+        (BusConfig(listen=("tcp/127.0.0.1:9",)), "no other agent is reached for 7 s; 12 messages"),
+    ],
+)
+def test_a_peer_without_others_is_given_time_to_meet_them(bus: BusConfig, text: str) -> None:
+    machine = Machine(CameraConfig(id="cam0", bus=bus))
+    machine.connected = False
+    assert machine.status().state == "running"
+    machine.wait(7.0)
+    assert machine.status().message == text
+
+
 def test_a_recorders_clock_that_was_never_set_or_that_jumps_is_a_reason() -> None:
     recorder = RecorderConfig(bus=ROUTER)
     unset = Machine(recorder, unix=1000.0)

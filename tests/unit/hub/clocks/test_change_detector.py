@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -73,6 +74,34 @@ def test_a_machine_that_was_suspended_is_not_a_step(counts_frames: bool) -> None
     assert camera.events == []
     camera.frames(60, step_ns=10_000_000_000)
     assert [event.step_s for event in camera.events] == pytest.approx([10.0], abs=1e-3)
+
+
+@pytest.mark.parametrize(("step_ns", "steps"), [(0, 0), (500_000_000, 1)])
+def test_a_late_frame_after_a_pause_is_no_step(step_ns: int, steps: int) -> None:
+    """Over a link with 0.3 s of jitter; a clock that is set forward makes the frame seem earlier."""
+    camera = Camera()
+    camera.frames(100)
+    camera.now_ns, camera.number = camera.now_ns + 500_000_000, camera.number + 1
+    camera.arrival += (500_000_000 - step_ns) * 1e-9 + 0.25 * (not step_ns)
+    camera.feed()
+    camera.arrival -= 0.25 * (not step_ns)
+    camera.frames(100)
+    assert len(camera.events) == steps
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+@pytest.mark.parametrize(("step_s", "steps"), [(0.45, 0), (30.0, 0), (-0.45, 1), (1.7e9, 1)])
+def test_of_frames_that_waited_for_the_hub_a_pause_is_no_step(step_s: float, steps: int, is_told: bool) -> None:
+    """A hub was restarted just after a camera had stalled without counting its frames: its pose was not used again."""
+    detector, events = ClockChangeDetector(), list[ClockChange]()
+    for number in range(200):
+        shown = round(1e9 * (number / 30.0 + step_s * (number >= 100)))
+        waited = number < 150
+        # Over a slow link it takes longer than the hub waits for a backlog.
+        arrival = 50.0 + max(number, 150) / 30.0 if not waited or not is_told else None
+        _, event = detector.handle("cam0", "b", number, number, shown, arrival, waited=waited and is_told)
+        events += [] if event is None else [event]
+    assert [event.kind for event in events] == ["step"] * steps
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -280,3 +309,22 @@ def test_a_false_alarm_is_not_extrapolated(sign: float) -> None:
     (event,) = detector.changes_since("cam0", "b")
     assert abs(event.rate_change) < 1.5e-4
     assert abs(event.step_s + event.rate_change * (55.0 - event.detected_at_s)) < 2.5e-3
+
+
+@pytest.mark.parametrize(("late_s", "ppm", "remains"), [(3e-3, 0.0, False), (0.0, -300.0, True)])
+def test_an_alarm_that_the_seconds_after_do_not_confirm_is_withdrawn(late_s: float, ppm: float, remains: bool) -> None:
+    """A hub that has just begun is busy for seconds, and frames are late by less and less."""
+    segments, rng, seen = ClockSegments(), np.random.default_rng(8), set[str]()
+    for number in range(30 * 60):
+        true = number / 30.0
+        shown = true + 1e-6 * ppm * max(0.0, true - 25.0)
+        late = 2e-3 + late_s / (1.0 + math.exp(true - 25.0)) + float(rng.exponential(3e-4))
+        message = pb.Observation(camera="cam0", boot_id="b", sequence=number, frame=number)
+        message.device_time_ns = round(shown * 1e9)
+        segments.assign(message, 100.0 + true + late)
+        seen |= segments.alarms.keys()
+    assert seen == {"cam0"}
+    assert [text.split()[4] for text in segments.alarms.values()] == (["drifts"] if remains else [])
+    (change,) = segments._detector.changes_since("cam0", "b")
+    assert change.rate_change == pytest.approx(1e-6 * ppm, abs=5e-6)
+    assert change.step_s == pytest.approx(0.0, abs=2e-3)

@@ -239,7 +239,30 @@ def test_an_ailing_agent_is_in_the_headline_within_five_seconds() -> None:
     state.presence("hub", "hub", alive=False, boot="boot-1")
     assert state.problems(2.0)[0] == "hub has ended"
     assert state.of_role("hub") == []
+    last = status("hub", 2)
+    last.role, last.state, last.message = "hub", "stopping", "it was stopped"
+    state.handle(last, 2.0)
+    assert state.problems(2.0)[0] == "hub has ended: it was stopped", "though its last status was read after its end"
+    state.presence("hub", "hub", alive=True, boot="boot-1")
+    assert state.problems(2.0)[0] == "hub is being stopped: it was stopped", "only the router had gone"
     assert "cam0 has sent no frames for 4 s" in state.problems(10.0)
+
+
+def test_of_a_degraded_hub_the_page_says_what_is_wrong_and_leaves_the_rest_to_the_rows() -> None:
+    """What the rows of the cameras and the advice say was said twice more, in bold, on half a page."""
+    state, ill = ViewState(), status("hub")
+    ill.role, ill.state = "hub", "degraded"
+    ill.message = (
+        "the times of cam2 stand still; 4 cameras calibrated; heard but not calibrated: dark (no rows); wave it"
+    )
+    state.handle(ill, 0.0)
+    state.handle(observation("cam0"), 0.0)
+    assert state.problems(1.0) == ["hub: the times of cam2 stand still"]
+    state.handle(status("rec"), 0.0)
+    state.agents["rec"].status.role, state.agents["rec"].status.state = "record", "degraded"
+    assert "stand still<br>▲ rec: " in overview(state, 1.0)
+    ill.message = "4 cameras calibrated; heard but not calibrated: dark (no rows)"
+    assert state.problems(1.0)[0] == f"hub: {ill.message}"
 
 
 def test_many_problems_are_cut_short() -> None:

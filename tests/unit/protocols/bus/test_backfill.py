@@ -168,6 +168,19 @@ def test_what_the_cache_does_not_have_any_more_is_counted() -> None:
     assert stage.lost == 2
 
 
+def test_who_ends_takes_what_is_held_back_along() -> None:
+    stage = Stage()
+    stage.take("a", 0, 3, 4, 7)
+    stage.take("b", 9)
+    stage.backfill.answer(stage.asked[0], 2, "key-a", b"a2")
+    stage.backfill.answer(stage.asked[1], 8, "key-b", b"b8")
+    stage.backfill.flush()
+    assert stage.out == [*names(0, 2, 3, 4, 7), *names(8, 9, source="b")]
+    assert stage.lost == 1 + 2
+    stage.take("a", 8)
+    assert stage.out[-1] == "a8"
+
+
 def test_the_end_of_an_older_question_is_no_answer() -> None:
     stage = Stage()
     stage.take("a", 0, 3)
