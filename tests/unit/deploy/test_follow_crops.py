@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -12,11 +12,12 @@ import pytest
 from deploy.offline.follow.calibration import read_given_calibration
 from deploy.offline.follow.crops import check_pictures, write_crops
 from deploy.offline.follow.source import FollowInput
+from edge.devices.playback.video_reader import VideoReader
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
-from tests.support.crowds import SIZE, ends, places, write_calibration
+from tests.support.crowds import HEIGHT, SIZE, ends, places, write_calibration
 
 CAMERA, FPS, FRAMES = "left", 5.0, 6
 HEAD, TORSO, LEGS = (40, 40, 230), (60, 200, 60), (220, 90, 30)  # BGR
@@ -27,6 +28,7 @@ class Track:
     id: int
     times: Floats
     position: Floats
+    height: Floats
     detections: list[tuple[str, int, int]]
 
 
@@ -58,7 +60,7 @@ def track(person: int, number: int = 4) -> Track:
     """The true track of one person, associated in every frame."""
     times = np.arange(FRAMES) / FPS
     place = np.array([[*places(float(time))[person], 0.0] for time in times])
-    return Track(number, times, place, [(CAMERA, frame, person) for frame in range(FRAMES)])
+    return Track(number, times, place, np.full(FRAMES, HEIGHT), [(CAMERA, frame, person) for frame in range(FRAMES)])
 
 
 def test_regions_are_cut_out_by_track_camera_and_time(filmed: FollowInput, tmp_path: Path) -> None:
@@ -70,14 +72,67 @@ def test_regions_are_cut_out_by_track_camera_and_time(filmed: FollowInput, tmp_p
     assert count == len(files) + len(list((out / "5").iterdir()))
     assert {"left_0.200_head.jpg", "left_0.200_torso.jpg", "left_1.000_head.jpg"} <= set(files)
     assert not any(name.startswith(".") for name in files)
-    for name, colour in (("head", HEAD), ("torso", TORSO)):
-        off = []
-        for path in out.glob(f"*/*_{name}.jpg"):
-            image = cv2.imread(str(path))
-            assert image is not None
-            middle = image[image.shape[0] // 3 : -image.shape[0] // 3, image.shape[1] // 3 : -image.shape[1] // 3]
-            off.append(float(np.abs(middle.reshape(-1, 3).mean(axis=0) - colour).max()))
-        assert np.median(off) < 25  # in a frame or two another person stands before this one
+    assert np.median(off(out, "head", HEAD)) < 25  # in a frame or two another person stands before this one
+    assert np.median(off(out, "torso", TORSO)) < 25
+
+
+def test_a_detection_with_its_head_elsewhere_is_cut_where_the_track_is(filmed: FollowInput, tmp_path: Path) -> None:
+    """Somebody hidden in part has the head where the silhouette ends, or none."""
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    changed = []
+    for number, message in enumerate(filmed.observations):
+        copy = pb.Observation()
+        copy.CopyFrom(message)
+        one = copy.detections[2]
+        one.head[:] = [] if number % 2 else [one.head[0] + 40.0, one.head[1] + 30.0]
+        changed.append(copy)
+    write_crops(tmp_path / "crops", replace(filmed, observations=changed), [track(2)], known)  # type: ignore[list-item]
+    heads = off(tmp_path / "crops", "head", HEAD)
+    assert len(heads) == FRAMES
+    assert np.median(heads) < 25
+
+
+def test_detections_without_frame_numbers_are_cut_from_the_frames_of_their_times(
+    filmed: FollowInput, tmp_path: Path
+) -> None:
+    """They count from the first frame with a detection."""
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    later = []
+    for number, message in enumerate(filmed.observations[4:]):
+        copy = pb.Observation()
+        copy.CopyFrom(message)
+        copy.sequence, copy.frame = number, 0
+        later.append(copy)
+    one = replace(track(2), detections=[(CAMERA, number, 2) for number in range(len(later))])
+    shot = replace(filmed, observations=later, times_ns=filmed.times_ns[4:])
+    write_crops(tmp_path / "crops", shot, [one], known)  # type: ignore[list-item]
+    heads = off(tmp_path / "crops", "head", HEAD)
+    assert len(heads) == FRAMES - 4
+    assert np.median(heads) < 25
+
+
+def test_a_video_of_another_size_than_the_detections_is_cut_at_the_same_places(
+    filmed: FollowInput, tmp_path: Path
+) -> None:
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    small = tmp_path / "left.avi"
+    writer = cv2.VideoWriter(str(small), cv2.VideoWriter.fourcc(*"MJPG"), FPS, (SIZE[0] // 2, SIZE[1] // 2))
+    for frame in VideoReader(filmed.videos[CAMERA]):
+        writer.write(cv2.resize(frame.image(), (SIZE[0] // 2, SIZE[1] // 2)))
+    writer.release()
+    write_crops(tmp_path / "crops", replace(filmed, videos={CAMERA: small}), [track(2)], known)  # type: ignore[list-item]
+    assert np.median(off(tmp_path / "crops", "head", HEAD)) < 25
+
+
+def off(folder: Path, region: str, colour: tuple[int, int, int]) -> list[float]:
+    """How far the middle of each picture of a region is from a colour (BGR)."""
+    out = []
+    for path in folder.glob(f"*/*_{region}.jpg"):
+        image = cv2.imread(str(path))
+        assert image is not None
+        middle = image[image.shape[0] // 3 : -image.shape[0] // 3, image.shape[1] // 3 : -image.shape[1] // 3]
+        out.append(float(np.abs(middle.reshape(-1, 3).mean(axis=0) - colour).max()))
+    return out
 
 
 def test_a_face_is_shown_where_somebody_walks_towards_the_camera(filmed: FollowInput, tmp_path: Path) -> None:
