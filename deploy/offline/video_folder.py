@@ -126,7 +126,7 @@ def session_from_videos(
     folder, session = Path(folder), Path(session)
     videos, warnings = list_videos(folder)
     if len(videos) < 2:
-        what = f"there is only one video ({videos[0].path.name})"
+        what = "; ".join((f"there is only one video ({videos[0].path.name})", *warnings))
         raise InputError(what, file=folder, remedy="put those of the other cameras beside it")
     given, tables = _given_rig(folder)
     own_marker = marker or (folder / MARKER_FILE if (folder / MARKER_FILE).exists() else None)
