@@ -25,12 +25,11 @@ from protocols.geometry.types import Floats, Image
 from protocols.log.read.images import image_runs, read_images
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.rig import METRES_PER_UNIT
 
 if TYPE_CHECKING:
     from deploy.offline.follow.calibration import GivenCalibration
     from deploy.offline.follow.source import FollowInput
-    from hub.tracking.offline import FollowedTrack
+    from hub.tracking.offline import FollowedTrack, FollowResult
 
 _HEAD_MARGIN = 1.3
 """Sides of the head's picture over those of the region of head and face: hair, and a few per cent of error in the
@@ -41,8 +40,8 @@ _SHOULDERS, _HIPS, _SHOULDER_WIDTH = 0.18, 0.52, 0.30
 _HEAD_OFF, _FOOT_OFF = 0.05, 0.15
 """Of the stature: where a detection's head or foot is farther from the track's, the track's are taken. A detection that
 somebody else, a thing or the border hides in part has its head elsewhere, or is of somebody else in part."""
-_MIN_SPEED_M_S = 0.25
-"""Who walks more slowly may look anywhere."""
+_MIN_SPEED = 0.15
+"""Statures a second, whatever the scale: 0.25 m/s. Who walks more slowly may look anywhere."""
 _REGIONS = "head", "face", "torso"
 _MIN_SIDE_PX = 6  # a smaller crop shows nothing
 _MIN_INSIDE = 0.7
@@ -70,7 +69,7 @@ def check_pictures(source: FollowInput, session: Path) -> None:
 def write_crops(
     folder: Path,
     source: FollowInput,
-    tracks: Sequence[FollowedTrack],
+    result: FollowResult,
     known: GivenCalibration,
     progress: Progress = lambda text, share: None,
 ) -> int:
@@ -83,7 +82,7 @@ def write_crops(
         for earlier in folder.glob(f"[0-9]*/*_*_{region}.jpg"):  # its numbers are of other people
             earlier.unlink()
     count = 0
-    for index, (name, frames) in enumerate((plan := _wanted(source, tracks, known)).items()):
+    for index, (name, frames) in enumerate((plan := _wanted(source, result, known)).items()):
         for sequence, image, scale in _pictures(source, name, known.sizes[name][0], frames.keys()):
             for one in frames[sequence]:
                 count += _cut(folder / str(one.track), name, one, image, scale)
@@ -91,16 +90,14 @@ def write_crops(
     return count
 
 
-def _wanted(
-    source: FollowInput, tracks: Sequence[FollowedTrack], known: GivenCalibration
-) -> dict[str, dict[int, list[_Wanted]]]:
+def _wanted(source: FollowInput, result: FollowResult, known: GivenCalibration) -> dict[str, dict[int, list[_Wanted]]]:
     """By camera and frame number, who is cut out."""
     frames = {(message.camera, message.sequence): message for message in source.observations}
     out: dict[str, dict[int, list[_Wanted]]] = {}
     for name, camera in known.calibration.cameras.items():
         tracked = TrackingCamera.from_calibration(camera)
         mine: dict[int, list[_Wanted]] = defaultdict(list)
-        for track in tracks:
+        for track in result.tracks:
             rows: list[tuple[int, int, pb.Detection]] = []
             taken: set[int] = set()
             for seen_by, sequence, index in sorted(track.detections, key=lambda entry: entry[1]):
@@ -113,9 +110,9 @@ def _wanted(
                     taken.add(interval)
                     rows.append((sequence, time_ns, message.detections[index]))
             times = np.array([time_ns for _, time_ns, _ in rows]) / NANOSECONDS
-            states = _states(track, times, known)
-            facing = _facing(track, times, states, tracked, known)
-            ends = _ends([detection for _, _, detection in rows], states, tracked, known)
+            states = _states(track, times, result.up)
+            facing = _facing(track, times, states, tracked, result.up)
+            ends = _ends([detection for _, _, detection in rows], states, tracked, result.up)
             for (sequence, _, _), time, towards, (head, foot) in zip(rows, times.tolist(), facing, ends, strict=True):
                 if np.isfinite([head, foot]).all():
                     mine[sequence].append(_Wanted(track.id, time, head, foot, towards))
@@ -124,24 +121,24 @@ def _wanted(
     return out
 
 
-def _states(track: FollowedTrack, times: Floats, known: GivenCalibration) -> Floats:
+def _states(track: FollowedTrack, times: Floats, up: Floats | None) -> Floats:
     """The filter's states (n, 7), without velocities, of a track at times (n,); NaN where up is not known."""
     mean = np.zeros((len(times), STATE_DIM))
-    if known.up is None:
+    if up is None:
         return np.full_like(mean, np.nan)
     height = np.interp(times, track.times, track.height)
     for axis in range(3):
-        mean[:, axis] = np.interp(times, track.times, track.position[:, axis]) + 0.5 * height * known.up[axis]
+        mean[:, axis] = np.interp(times, track.times, track.position[:, axis]) + 0.5 * height * up[axis]
     mean[:, LOG_SIZE] = np.log(height)
     return mean
 
 
 def _ends(
-    detections: Sequence[pb.Detection], states: Floats, camera: TrackingCamera, known: GivenCalibration
+    detections: Sequence[pb.Detection], states: Floats, camera: TrackingCamera, up: Floats | None
 ) -> list[tuple[Floats, Floats]]:
     """Head and foot (2,) [px] of each detection of a track, or of its states (n, 7); NaN where neither has them."""
     kind = np.full(len(states), KIND_INDEX["person"])
-    value = predict_measurement(camera, states, kind, known.up).value
+    value = predict_measurement(camera, states, kind, up).value
     out = []
     for detection, *track in zip(
         detections, *(camera.intrinsics.project_normalised(value[:, rows]) for rows in (HEAD, FOOT)), strict=True
@@ -155,18 +152,17 @@ def _ends(
 
 
 def _facing(
-    track: FollowedTrack, times: Floats, states: Floats, camera: TrackingCamera, known: GivenCalibration
+    track: FollowedTrack, times: Floats, states: Floats, camera: TrackingCamera, up: Floats | None
 ) -> list[bool]:
     """Whether a face may be seen at times (n,) with states (n, 7), if people look where they walk."""
-    if known.up is None or len(track.times) < 2 or not len(times):
+    if up is None or len(track.times) < 2 or not len(times):
         return [False] * len(times)
     velocity = np.gradient(track.position, track.times, axis=0)
-    velocity -= np.outer(velocity @ known.up, known.up)
+    velocity -= np.outer(velocity @ up, up)
     ahead = np.column_stack([np.interp(times, track.times, velocity[:, axis]) for axis in range(3)])
     speed = np.linalg.norm(ahead, axis=1, keepdims=True)
-    slow = _MIN_SPEED_M_S / METRES_PER_UNIT[known.calibration.units]
-    ahead /= np.where(speed < slow, np.nan, speed)
-    views = head_views(states, ahead, camera, TrackerParameters(up=known.up))
+    ahead /= np.where(speed < _MIN_SPEED * np.exp(states[:, LOG_SIZE, None]), np.nan, speed)
+    views = head_views(states, ahead, camera, TrackerParameters(up=up))
     return [view not in ("", "back") for view in views]
 
 
@@ -203,11 +199,11 @@ def _pictures(
         if run.camera != camera:
             continue
         for picture in read_images(reader, run):
-            sequence = numbers.get((run.boot, picture.device_time_ns))
+            sequence = numbers.get((run.boot, picture.device_time_ns), -1)
             if sequence not in missing:
                 continue
             image = decode_jpeg(picture.jpeg)
-            if image is not None and sequence is not None and picture.width > 0:
+            if image is not None and picture.width > 0:
                 yield sequence, image, image.shape[1] / picture.width
 
 

@@ -13,12 +13,14 @@ from deploy.offline.follow.calibration import read_given_calibration
 from deploy.offline.follow.crops import check_pictures, write_crops
 from deploy.offline.follow.source import FollowInput
 from edge.devices.playback.video_reader import VideoReader
+from hub.tracking.offline import FollowResult
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from tests.support.crowds import HEIGHT, SIZE, ends, places, write_calibration
 
+UP = np.array([0.0, 0.0, 1.0])
 CAMERA, FPS, FRAMES = "left", 5.0, 6
 HEAD, TORSO, LEGS = (40, 40, 230), (60, 200, 60), (220, 90, 30)  # BGR
 
@@ -66,7 +68,7 @@ def track(person: int, number: int = 4) -> Track:
 def test_regions_are_cut_out_by_track_camera_and_time(filmed: FollowInput, tmp_path: Path) -> None:
     known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
     out = tmp_path / "crops"
-    count = write_crops(out, filmed, [track(0), track(1, 5)], known)  # type: ignore[list-item]
+    count = write_crops(out, filmed, result(track(0), track(1, 5)), known)
     assert sorted(path.name for path in out.iterdir()) == ["4", "5"]
     files = sorted(path.name for path in (out / "4").iterdir())
     assert count == len(files) + len(list((out / "5").iterdir()))
@@ -86,7 +88,7 @@ def test_a_detection_with_its_head_elsewhere_is_cut_where_the_track_is(filmed: F
         one = copy.detections[2]
         one.head[:] = [] if number % 2 else [one.head[0] + 40.0, one.head[1] + 30.0]
         changed.append(copy)
-    write_crops(tmp_path / "crops", replace(filmed, observations=changed), [track(2)], known)  # type: ignore[list-item]
+    write_crops(tmp_path / "crops", replace(filmed, observations=changed), result(track(2)), known)
     heads = off(tmp_path / "crops", "head", HEAD)
     assert len(heads) == FRAMES
     assert np.median(heads) < 25
@@ -105,7 +107,7 @@ def test_detections_without_frame_numbers_are_cut_from_the_frames_of_their_times
         later.append(copy)
     one = replace(track(2), detections=[(CAMERA, number, 2) for number in range(len(later))])
     shot = replace(filmed, observations=later, times_ns=filmed.times_ns[4:])
-    write_crops(tmp_path / "crops", shot, [one], known)  # type: ignore[list-item]
+    write_crops(tmp_path / "crops", shot, result(one), known)
     heads = off(tmp_path / "crops", "head", HEAD)
     assert len(heads) == FRAMES - 4
     assert np.median(heads) < 25
@@ -120,8 +122,12 @@ def test_a_video_of_another_size_than_the_detections_is_cut_at_the_same_places(
     for frame in VideoReader(filmed.videos[CAMERA]):
         writer.write(cv2.resize(frame.image(), (SIZE[0] // 2, SIZE[1] // 2)))
     writer.release()
-    write_crops(tmp_path / "crops", replace(filmed, videos={CAMERA: small}), [track(2)], known)  # type: ignore[list-item]
+    write_crops(tmp_path / "crops", replace(filmed, videos={CAMERA: small}), result(track(2)), known)
     assert np.median(off(tmp_path / "crops", "head", HEAD)) < 25
+
+
+def result(*tracks: Track, up: Floats | None = UP) -> FollowResult:
+    return FollowResult(tracks, {}, (), up)  # type: ignore[arg-type]
 
 
 def off(folder: Path, region: str, colour: tuple[int, int, int]) -> list[float]:
@@ -136,7 +142,8 @@ def off(folder: Path, region: str, colour: tuple[int, int, int]) -> list[float]:
 
 
 def test_a_face_is_shown_where_somebody_walks_towards_the_camera(filmed: FollowInput, tmp_path: Path) -> None:
-    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    """Also where the calibration has no vertical, and people have shown it."""
+    known = replace(read_given_calibration(write_calibration(tmp_path / "calibration.toml")), up=None)
     towards = known.calibration.cameras[CAMERA].pose.position[:2]
     times = np.arange(FRAMES) / FPS
     for sign, faces in ((1.0, FRAMES), (-1.0, 0)):
@@ -144,7 +151,7 @@ def test_a_face_is_shown_where_somebody_walks_towards_the_camera(filmed: FollowI
         one = track(0, 1)
         one.position[:, :2] = one.position[0, :2] + np.outer(times, step)
         out = tmp_path / f"crops{sign:g}"
-        write_crops(out, filmed, [one], known)  # type: ignore[list-item]
+        write_crops(out, filmed, result(one), known)
         assert len(list(out.glob("1/*_face.jpg"))) == faces
         assert len(list(out.glob("1/*_head.jpg"))) == FRAMES
 
@@ -152,7 +159,7 @@ def test_a_face_is_shown_where_somebody_walks_towards_the_camera(filmed: FollowI
 def test_at_most_one_picture_between_two_wanted_times(filmed: FollowInput, tmp_path: Path) -> None:
     known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
     few = FollowInput(filmed.name, filmed.observations, filmed.times_ns[::3], (), filmed.videos)
-    write_crops(tmp_path / "crops", few, [track(0)], known)  # type: ignore[list-item]
+    write_crops(tmp_path / "crops", few, result(track(0)), known)
     assert len(list((tmp_path / "crops").glob("4/*_head.jpg"))) == 3
 
 
@@ -162,7 +169,7 @@ def test_pictures_of_an_earlier_run_are_replaced(filmed: FollowInput, tmp_path: 
     (tmp_path / "crops" / "4").mkdir(parents=True)
     for name in ("left_0.123_head.jpg", "mine.jpg"):
         (tmp_path / "crops" / "4" / name).write_bytes(b"")
-    count = write_crops(tmp_path / "crops", filmed, [track(0)], known)  # type: ignore[list-item]
+    count = write_crops(tmp_path / "crops", filmed, result(track(0)), known)
     assert len(list((tmp_path / "crops" / "4").iterdir())) == count + 1
     assert (tmp_path / "crops" / "4" / "mine.jpg").exists()
 
