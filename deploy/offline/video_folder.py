@@ -75,7 +75,12 @@ class VideoSession(RecordedSession):
 
 def is_video_folder(folder: Path) -> bool:
     """Whether a folder contains videos and is not yet a session."""
-    return folder.is_dir() and not (folder / OBSERVATIONS_FILE).exists() and bool(_video_paths(folder))
+    return has_videos(folder) and not (folder / OBSERVATIONS_FILE).exists()
+
+
+def has_videos(folder: Path) -> bool:
+    """Whether a folder contains videos, beside whatever else."""
+    return folder.is_dir() and bool(_video_paths(folder))
 
 
 def list_videos(folder: Path) -> tuple[list[VideoFile], list[str]]:

@@ -72,8 +72,9 @@ def write_crops(
     result: FollowResult,
     known: GivenCalibration,
     progress: Progress = lambda text, share: None,
-) -> int:
-    """Write ``folder/ID/CAMERA_TIME_{head,face,torso}.jpg``, in place of those of an earlier run; returns their number.
+) -> tuple[int, list[str]]:
+    """Write ``folder/ID/CAMERA_TIME_{head,face,torso}.jpg``, in place of those of an earlier run; their number, and
+    warnings.
 
     TIME: reference time [s]. One picture a region, track and camera between two of the wanted times. The region of the
     face only where the person walks towards the camera or across its view. Raises InputError, OSError.
@@ -81,13 +82,18 @@ def write_crops(
     for region in _REGIONS:
         for earlier in folder.glob(f"[0-9]*/*_*_{region}.jpg"):  # its numbers are of other people
             earlier.unlink()
-    count = 0
+    count, warnings = 0, []
     for index, (name, frames) in enumerate((plan := _wanted(source, result, known)).items()):
+        shown = 0
         for sequence, image, scale in _pictures(source, name, known.sizes[name][0], frames.keys()):
+            shown += 1
+            progress(name, (index + shown / len(frames)) / len(plan))
             for one in frames[sequence]:
                 count += _cut(folder / str(one.track), name, one, image, scale)
-        progress(name, (index + 1) / len(plan))
-    return count
+        if source.videos and shown < len(frames):  # a log need not have a picture of every frame
+            lacking = f"{len(frames) - shown} of {len(frames)} frames with people are in no video"
+            warnings.append(f"{name}: {lacking}: nothing is cut out of them")
+    return count, warnings
 
 
 def _wanted(source: FollowInput, result: FollowResult, known: GivenCalibration) -> dict[str, dict[int, list[_Wanted]]]:

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from deploy.cli import run
 from deploy.offline.follow.calibration import read_given_calibration
 from deploy.offline.follow.crops import check_pictures, write_crops
-from deploy.offline.follow.source import FollowInput
+from deploy.offline.follow.source import FollowInput, read_follow_input
 from edge.devices.playback.video_reader import VideoReader
 from hub.tracking.offline import FollowResult
 from protocols.core.clocks import NANOSECONDS
@@ -19,6 +20,7 @@ from protocols.core.errors import InputError
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from tests.support.crowds import HEIGHT, SIZE, ends, places, write_calibration
+from tests.support.videos import write_video
 
 UP = np.array([0.0, 0.0, 1.0])
 CAMERA, FPS, FRAMES = "left", 5.0, 6
@@ -68,7 +70,7 @@ def track(person: int, number: int = 4) -> Track:
 def test_regions_are_cut_out_by_track_camera_and_time(filmed: FollowInput, tmp_path: Path) -> None:
     known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
     out = tmp_path / "crops"
-    count = write_crops(out, filmed, result(track(0), track(1, 5)), known)
+    count, _ = write_crops(out, filmed, result(track(0), track(1, 5)), known)
     assert sorted(path.name for path in out.iterdir()) == ["4", "5"]
     files = sorted(path.name for path in (out / "4").iterdir())
     assert count == len(files) + len(list((out / "5").iterdir()))
@@ -169,9 +171,31 @@ def test_pictures_of_an_earlier_run_are_replaced(filmed: FollowInput, tmp_path: 
     (tmp_path / "crops" / "4").mkdir(parents=True)
     for name in ("left_0.123_head.jpg", "mine.jpg"):
         (tmp_path / "crops" / "4" / name).write_bytes(b"")
-    count = write_crops(tmp_path / "crops", filmed, result(track(0)), known)
+    count, warnings = write_crops(tmp_path / "crops", filmed, result(track(0)), known)
     assert len(list((tmp_path / "crops" / "4").iterdir())) == count + 1
     assert (tmp_path / "crops" / "4" / "mine.jpg").exists()
+    assert not warnings
+
+
+def test_frames_that_a_video_lacks_are_counted(filmed: FollowInput, tmp_path: Path) -> None:
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    writer = cv2.VideoWriter(str(tmp_path / "left.avi"), cv2.VideoWriter.fourcc(*"MJPG"), FPS, SIZE)
+    for frame in list(VideoReader(filmed.videos[CAMERA]))[:4]:
+        writer.write(frame.image())
+    writer.release()
+    cut = replace(filmed, videos={CAMERA: tmp_path / "left.avi"})
+    count, (warning,) = write_crops(tmp_path / "crops", cut, result(track(0)), known)
+    assert count > 0
+    assert warning.startswith("left: 2 of 6 frames with people are in no video")
+
+
+def test_the_videos_beside_a_sessions_observations_are_its_pictures(tmp_path: Path) -> None:
+    assert run(["simulate", "people", "--out", str(tmp_path), "--cameras", "2", "--people", "1", "--seconds", "3"]) == 0
+    write_video(tmp_path / "cam0.mp4", [np.full((480, 640, 3), 90, np.uint8)] * 3, [0.0, 0.1, 0.2])
+    known = read_given_calibration(tmp_path / "truth_calibration.toml")
+    source = read_follow_input(tmp_path, known, "person", tmp_path / "out")
+    assert source.videos == {"cam0": tmp_path / "cam0.mp4"}
+    check_pictures(source, tmp_path)
 
 
 def test_a_session_without_pictures_is_named(filmed: FollowInput, tmp_path: Path) -> None:
