@@ -37,9 +37,9 @@ height of a detection."""
 _SHOULDERS, _HIPS, _SHOULDER_WIDTH = 0.18, 0.52, 0.30
 """Of a torso, in statures from the top of the head: Drillis and Contini (1966) have shoulders at 0.818 and hips at
 0.530 of the stature, and 0.259 across the shoulders; the arms add to that."""
-_HEAD_OFF, _FOOT_OFF = 0.05, 0.15
-"""Of the stature: where a detection's head or foot is farther from the track's, the track's are taken. A detection that
-somebody else, a thing or the border hides in part has its head elsewhere, or is of somebody else in part."""
+_HEAD_OFF, _FOOT_OFF = 0.04, 0.15
+"""Of the stature; 0.04 are a quarter of a head. Where a detection's head or foot is farther from the track's, the
+track's are taken: who is hidden in part, or cut by the border, has the head elsewhere."""
 _MIN_SPEED = 0.15
 """Statures a second, whatever the scale: 0.25 m/s. Who walks more slowly may look anywhere."""
 _REGIONS = "head", "face", "torso"

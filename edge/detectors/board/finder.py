@@ -84,8 +84,11 @@ class Finder:
             numbers = self._mirrored(numbers)
         return numbers, pixels
 
-    def refine(self, grey: Grey, corners: Corners) -> Corners:
-        """The corners again in a larger image, at most half a window from ``corners``, which are in its pixels."""
+    def refine(self, grey: Grey, corners: Corners, found_px: float = 1.0) -> Corners:
+        """The corners again, near ``corners``, which are in the image's pixels.
+
+        found_px: size of a pixel of the image in which they were found.
+        """
         numbers, pixels = corners
         if not len(numbers):
             return corners
@@ -96,8 +99,10 @@ class Finder:
         for half in np.unique(halves).tolist():
             found = cv2.cornerSubPix(grey, begin[halves == half], (half, half), (-1, -1), criteria)
             refined[halves == half] = np.reshape(found, (-1, 2))
-        moved = np.linalg.norm(refined - pixels, axis=1) < 1.5 * halves
-        refined = np.where(moved[:, None], refined, pixels)
+        # In windows of 5 px some end at another edge, 1 to 3 px away; OpenCV's ChArUco corners are less than 1 px off.
+        most = 1.5 * halves if self._charuco is None else np.maximum(0.5 * halves, found_px)
+        near = np.linalg.norm(refined - pixels, axis=1) < most
+        refined = np.where(near[:, None], refined, pixels)
         return numbers, self._measured(np.asarray(255 - grey if self.board.inverted else grey, np.uint8), refined)
 
     def _half_windows(self, corners: Corners) -> Ints:
