@@ -226,6 +226,7 @@ def _pair(pair: Any) -> PairReport:
         fundamental,
         number("inliers"),
         number("rms_px"),
+        number("lag_std_s"),
         _tests(table.get("acceptance")),
     )
 

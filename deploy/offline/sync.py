@@ -58,9 +58,9 @@ class SynchronisedVideo:
 
 def read_time_maps(
     file: Path, films: Mapping[str, VideoReader]
-) -> tuple[str, dict[str, TimeMap], dict[str, float], Mapping[str, str]]:
-    """Reference camera, time maps and stds [s] of a calibration.toml, or from the pairs of a result.json; and why other
-    cameras were refused.
+) -> tuple[str, dict[str, TimeMap], Mapping[str, float | None], Mapping[str, str]]:
+    """Reference camera, time maps and stds [s] of a calibration.toml, or from the pairs of a result.json, None where
+    they are not known; and why other cameras were refused.
 
     A result.json has lags also where no camera could be placed. Raises InputError, and Refused where it has none.
     """
@@ -73,7 +73,7 @@ def read_time_maps(
     try:
         document = json.loads(read_text(file))
         pairs = [
-            (str(a), str(b), float(pair["lag_s"]), float(pair.get("clock_rate") or 1.0))
+            (str(a), str(b), float(pair["lag_s"]), float(pair.get("clock_rate") or 1.0), pair.get("lag_std_s"))
             for pair in document["pairs"]
             if pair.get("lag_s") is not None
             for a, b in (pair["cameras"],)
@@ -86,30 +86,35 @@ def read_time_maps(
 
 
 def time_maps_of_pairs(
-    pairs: Sequence[tuple[str, str, float, float]], films: Mapping[str, VideoReader]
-) -> tuple[str, dict[str, TimeMap], dict[str, float]]:
-    """Time maps from the lags of pairs (a, b, t_a - t_b in the middle of their overlap [s], rate of a's clock by b's).
+    pairs: Sequence[tuple[str, str, float, float, float | None]], films: Mapping[str, VideoReader]
+) -> tuple[str, dict[str, TimeMap], dict[str, float | None]]:
+    """Time maps and stds from the lags of pairs (a, b, t_a - t_b in the middle of their overlap [s], rate of a's clock
+    by b's, std of the lag [s] or None).
 
     Raises Refused where the lag of no pair is known.
     """
-    usable = [pair for pair in pairs if {pair[0], pair[1]} <= set(films) and all(map(math.isfinite, pair[2:]))]
+    usable = [pair for pair in pairs if {pair[0], pair[1]} <= set(films) and all(map(math.isfinite, pair[2:4]))]
     if not usable:
         raise Refused("the lag of no pair of these videos is known: film something that moves in front of both")
     reference = next(name for name in films if any(name in pair[:2] for pair in usable))
     maps = {reference: TimeMap(1.0, 0.0)}
+    stds: dict[str, float | None] = {reference: 0.0}
     spans = {name: reference_span(film, TimeMap(1.0, 0.0)) for name, film in films.items()}
     grown = True
     while grown:
         grown = False
-        for a, b, lag, rate in usable:
+        for a, b, lag, rate, std in usable:
+            if (a in maps) == (b in maps):
+                continue
+            known, new = (a, b) if a in maps else (b, a)
+            before, grown = stds[known], True
+            stds[new] = None if std is None or before is None else math.hypot(before, std)
             first, last = max(spans[a].first, spans[b].first + lag), min(spans[a].last, spans[b].last + lag)
             middle = 0.5 * (first + last)
             a_from_b = TimeMap(rate, middle - rate * (middle - lag))
-            if a in maps and b not in maps:
-                maps[b], grown = _chained(maps[a], a_from_b), True
-            elif b in maps and a not in maps:
-                maps[a], grown = _chained(maps[b], TimeMap(1.0 / rate, -a_from_b.time_offset / rate)), True
-    return reference, maps, dict.fromkeys(maps, 0.0)
+            b_from_a = TimeMap(1.0 / rate, -a_from_b.time_offset / rate)
+            maps[new] = _chained(maps[known], a_from_b if known == a else b_from_a)
+    return reference, maps, stds
 
 
 def _chained(outer: TimeMap, inner: TimeMap) -> TimeMap:

@@ -75,7 +75,12 @@ class VideoSession(RecordedSession):
 
 def is_video_folder(folder: Path) -> bool:
     """Whether a folder contains videos and is not yet a session."""
-    return folder.is_dir() and not (folder / OBSERVATIONS_FILE).exists() and bool(_video_paths(folder))
+    return has_videos(folder) and not (folder / OBSERVATIONS_FILE).exists()
+
+
+def has_videos(folder: Path) -> bool:
+    """Whether a folder contains videos, beside whatever else."""
+    return folder.is_dir() and bool(_video_paths(folder))
 
 
 def list_videos(folder: Path) -> tuple[list[VideoFile], list[str]]:
@@ -126,7 +131,7 @@ def session_from_videos(
     folder, session = Path(folder), Path(session)
     videos, warnings = list_videos(folder)
     if len(videos) < 2:
-        what = f"there is only one video ({videos[0].path.name})"
+        what = "; ".join((f"there is only one video ({videos[0].path.name})", *warnings))
         raise InputError(what, file=folder, remedy="put those of the other cameras beside it")
     given, tables = _given_rig(folder)
     own_marker = marker or (folder / MARKER_FILE if (folder / MARKER_FILE).exists() else None)

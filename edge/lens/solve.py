@@ -212,12 +212,19 @@ def _with_board(
 
 
 def _pinhole(views: list[BoardView], size: tuple[int, int], held: bool) -> _Fit:
+    """From a usual field of view, and from the views' homographies (Zhang 2000), which views face on do not allow.
+
+    Of a few corners far from the middle OpenCV may take a wrong pose, from one start and not from the other.
+    """
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32)[:, None] for view in views]
-    start = intrinsics_from_field_of_view(size, 65.0, False).matrix
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | (_FEW_FLAGS if held else 0)
-    _, *fit = cv2.calibrateCamera(points, pixels, size, start, np.zeros(5), flags=flags)
-    return _flat(fit, 5)
+    guess: Any = intrinsics_from_field_of_view(size, 65.0, False).matrix
+    few = _FEW_FLAGS if held else 0
+    fits: list[Any] = []
+    for start, flags in ((guess, few | cv2.CALIB_USE_INTRINSIC_GUESS), (None, few)):
+        with suppress(cv2.error):
+            fits.append(cv2.calibrateCamera(points, pixels, size, start, np.zeros(5), flags=flags))
+    return _best(fits, 5)
 
 
 def _fisheye(views: list[BoardView], size: tuple[int, int]) -> _Fit:
@@ -232,10 +239,7 @@ def _fisheye(views: list[BoardView], size: tuple[int, int]) -> _Fit:
         start = intrinsics_from_field_of_view(size, degrees, True).matrix
         with suppress(cv2.error):  # an assertion, where a view has no pose
             fits.append(cv2.fisheye.calibrate(points, pixels, size, start, np.zeros((4, 1)), flags=flags))
-    if not fits:
-        raise Refused("no fisheye fits these views: tilt the board in different directions")
-    _, *fit = min(fits, key=lambda fit: float(np.nan_to_num(fit[0], nan=np.inf)))
-    return _flat(fit, 4)
+    return _best(fits, 4)
 
 
 def _ahead(views: list[BoardView], size: tuple[int, int]) -> list[BoardView]:
@@ -258,9 +262,13 @@ def _ahead(views: list[BoardView], size: tuple[int, int]) -> list[BoardView]:
     return views
 
 
-def _flat(fit: list[Any], count: int) -> _Fit:
-    """OpenCV's solution for a plane, with ``count`` distortions."""
-    matrix, distortions, rotations, translations = fit
+def _best(fits: list[Any], count: int) -> _Fit:
+    """OpenCV's solution for a plane, with ``count`` distortions, that misses the corners least."""
+    if not fits:
+        raise Refused("no lens fits these views: tilt the board in different directions")
+    _, matrix, distortions, rotations, translations = min(
+        fits, key=lambda fit: float(np.nan_to_num(fit[0], nan=np.inf))
+    )
     focal_and_centre = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     poses = [np.r_[np.ravel(turn), np.ravel(place)] for turn, place in zip(rotations, translations, strict=True)]
     return _Fit(np.r_[focal_and_centre, np.ravel(distortions)[:count], np.zeros(_SHAPE)], np.array(poses))

@@ -67,11 +67,13 @@ class CameraSummary:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FollowResult:
-    """Tracks, in the order of their first times, and what each camera contributed."""
+    """Tracks, in the order of their first times, and what each camera contributed. up: (3,) unit vector in the world
+    frame, given or estimated; None = unknown."""
 
     tracks: tuple[FollowedTrack, ...]
     cameras: dict[str, CameraSummary]
     warnings: tuple[str, ...] = ()
+    up: Floats | None = None
 
 
 def follow(
@@ -114,7 +116,7 @@ def follow(
     scans = smoother.run(progress=lambda share: said(0.5 + 0.5 * share)) if smoother is not None else []
     tracks = _sampled(smoother, scans, np.asarray(times_ns, dtype=np.int64), up) if smoother is not None else ()
     summaries = _summaries(smoother, state, cameras)
-    return FollowResult(tracks, summaries, (*warnings, *_unused(summaries)))
+    return FollowResult(tracks, summaries, (*warnings, *_unused(summaries)), up)
 
 
 def _tracked(

@@ -57,7 +57,8 @@ class PairReport:
 
     lag_s: t_a - t_b of one instant, at mid-overlap [s]. clock_rate: t_a's rate against t_b. fundamental:
     (3, 3), undistorted pixels, norm 1, ``m_aᵀ F m_b = 0``, None where unknown. inliers: share, 0..1. acceptance: the
-    tests that were made, in order.
+    tests that were made, in order. lag_std_s: of lag_s [s], of pairs that no solution of all cameras contains: lens and
+    readout included where the lenses are given, else by noise alone.
     """
 
     cameras: tuple[str, str]
@@ -67,4 +68,5 @@ class PairReport:
     fundamental: npt.NDArray[np.float64] | None = None
     inliers: float | None = None
     rms_px: float | None = None
+    lag_std_s: float | None = None
     acceptance: tuple[AcceptanceTest, ...] = ()

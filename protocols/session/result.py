@@ -118,6 +118,7 @@ def _pair(pair: PairReport) -> dict[str, Any]:
     return {
         "cameras": list(pair.cameras),
         "lag_s": pair.lag_s,
+        "lag_std_s": pair.lag_std_s,
         "clock_rate": pair.clock_rate,
         "fundamental": None if pair.fundamental is None else np.asarray(pair.fundamental).ravel(),
         "inliers": pair.inliers,

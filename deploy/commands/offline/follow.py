@@ -143,8 +143,8 @@ def follow(
     written = [out / name for name in (TRACKS, RESULT, REPORT)]
     if crops is not None:
         with progress_bar("cutting out heads and torsos", quiet=json) as progress:
-            count = write_crops(crops, source, result.tracks, known, progress)
-        warnings += [] if count else ["no picture shows a followed person large enough for --crops"]
+            count, lacking = write_crops(crops, source, result, known, progress)
+        warnings += lacking if count else [*lacking, "no picture shows a followed person large enough for --crops"]
         written.append(crops)
     document = result_document(
         result,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -77,7 +78,7 @@ def intrinsics(
         raise InputError("--model and --field-of-view each give the field of view", remedy="keep one")
     from edge.detectors.board.description import Board, check_board
     from edge.devices.playback.video_reader import VideoReader
-    from edge.lens.board import MIN_CORNERS, BoardView, board_views
+    from edge.lens.board import BoardView, board_views
     from edge.lens.models import FIELD_OF_VIEW_STD, find_lens_model, horizontal_field_of_view
     from edge.lens.solve import MIN_VIEWS, LensCalibration, calibrate_lens, coverage_map, intrinsics_from_field_of_view
     from protocols.core.files import write_atomically
@@ -101,15 +102,15 @@ def intrinsics(
         step = max(1, round(reader.info.fps / _MAX_RATE_HZ), -(-total // _MAX_FRAMES))
         step = 1 if video.is_dir() else step
         views: list[BoardView] = []
+        reasons = Counter[str]()
         with progress_bar(f"looking for the board in {video.name}", quiet=json) as progress:
-            for view in board_views(described, reader, step, reader.info.size[0]):
+            for view in board_views(described, reader, step, reader.info.size[0], reasons):
                 views.append(view)
                 progress(f"{len(views)} views, frame {view.frame}", min(view.frame / total, 1.0) if total else 0.0)
-        if video.is_dir() and len(views) < total:
-            unused = (
-                f"{total - len(views)} of {total} photographs are not used: no board, fewer than {MIN_CORNERS} of its "
-                "corners, or the board where it was before"
-            )
+        if count := reasons.total():
+            what = "photographs" if video.is_dir() else "frames looked at"
+            every = ", ".join(f"{number} {reason}" for reason, number in reasons.most_common())
+            unused = f"{count} of {count + len(views)} {what} are not used: {every}"
         try:
             fit = calibrate_lens(views, reader.info.size, fisheye)
         except Refused as refusal:
@@ -150,7 +151,8 @@ def intrinsics(
             lines.append(f"the board is {shape}, which was allowed for")
         covered = f"corners in each part of the image ({100 * fit.coverage:.0f} %):"
         lines += [f"corners fit to {fit.rms_px:.3f} px; {covered}", *coverage_map(fit.cells)]
-    warnings = [*reader.warnings, *filter(None, [unused])]
+    # A video is meant to have more frames than different views.
+    warnings = [*reader.warnings, *filter(None, [unused if video.is_dir() else ""])]
     return answer(document | {"warnings": warnings}, [*lines, *closing_lines(warnings, [out])], json)
 
 

@@ -130,7 +130,7 @@ def sync(
     for name, video in done.items():
         at = 0.5 * (video.time[0] + video.time[-1])
         lag = known[name].clock_rate * at + known[name].time_offset - at
-        std = f" ± {1e3 * stds[name]:.3f} ms" if stds[name] > 0.0 else ""
+        std = f" ± {1e3 * known_std:.3f} ms" if (known_std := stds[name]) else ""
         text = f"{name}: {len(video.time)} frames, clock {lag:+.4f} s{std} against {reference}"
         if videos == "retime":
             middle, worst = 1e3 * float(abs(video.error).mean()), 1e3 * float(abs(video.error).max())
@@ -159,6 +159,9 @@ def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
         refusal.pairs += sound_pairs(session.clock_priors, refusal.pairs)
         save_refusal(out, refusal, session)
         if not any(pair.lag_s is not None for pair in refusal.pairs):
+            if refusal.pairs:  # poses and lenses, which the refusal may be about, are not asked for here
+                every = "; ".join(f"{' and '.join(pair.cameras)}: {pair.status}" for pair in refusal.pairs)
+                refusal.reason = f"the lag of no pair of these videos is known ({every})"
             raise
         return out / RESULT
     return out / CALIBRATION

@@ -51,7 +51,7 @@ def follow_report(result: FollowResult, source: FollowInput, known: GivenCalibra
     """The page: one file that loads nothing; the same input gives the same bytes. document: of result.json."""
     tracks = sorted(result.tracks, key=lambda track: track.id)
     unit = str(document["units"])
-    view = PlanView.of(tracks, known, plan_axes(known.up), unit)
+    view = PlanView.of(tracks, known, plan_axes(result.up), unit)
     seen = _seen(result, source, known)
     span = document["first_time"], document["last_time"]
     shown = _longest(tracks)

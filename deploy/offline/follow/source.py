@@ -44,7 +44,7 @@ _MAX_ROWS = 2_000_000
 class FollowInput:
     """Detections of one kind and the reference times [ns] at which tracks are wanted.
 
-    video: the video of each camera, where there are any. log: the log that was read, where it was one.
+    videos: the video of each camera, where there are any. log: the log that was read, where it was one.
     """
 
     name: str
@@ -84,7 +84,7 @@ def read_follow_input(
     Raises InputError (file, line, what, remedy), and Refused where there is nothing to follow.
     """
     from deploy.offline.follow.video_detection import detect_videos
-    from deploy.offline.video_folder import is_video_folder, list_videos
+    from deploy.offline.video_folder import has_videos, is_video_folder, list_videos
 
     shared, log = known.rig.shared_clock, None
     videos: dict[str, Path] = {}
@@ -106,7 +106,7 @@ def read_follow_input(
         raise InputError(what, file=session, remedy=remedy)
     else:
         messages = object_messages(read_objects(file, known.file_sizes))
-        if is_video_folder(session):
+        if has_videos(session):
             videos = {video.camera: video.path for video in list_videos(session)[0]}
         if session.is_dir() and (session / RIG_FILE).exists():
             shared |= read_rig(session / RIG_FILE).shared_clock

@@ -144,5 +144,5 @@ class BoardDetector:
         numbers, pixels = self._finder.find(resized, thorough=thorough, cut=cut, rough=scale < 1.0)
         full = (pixels + 0.5) * [part.shape[1] / size[0], part.shape[0] / size[1]] - 0.5
         if scale < 1.0:
-            numbers, full = self._finder.refine(part, (numbers, full))
+            numbers, full = self._finder.refine(part, (numbers, full), 1.0 / scale)
         return numbers, full + [x, y]

@@ -28,6 +28,7 @@ Corners = tuple[Ints, Floats]
 NOTHING: Corners = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
 _SUBPIX_LEAST, _SUBPIX_MOST = 2, 9  # px: half window
 _SUBPIX_SHARE, _SUBPIX_SHARE_OF_TAGS = 0.4, 0.12  # of the distance of neighbouring corners; tags are in between
+_SUBPIX_MARGIN = 2.0  # px: from a window to the nearest marker of a ChArUco board, whose edge is blurred
 _LEAST_CUT = 3  # rows and columns of corners of a part of a chessboard, OpenCV's least
 _MOST_CHANGE = 0.4  # of the step between corners to the next: a board seen from 5 squares away, tilted by 60 degrees
 
@@ -49,8 +50,10 @@ class Finder:
         self._numbers: dict[str, int] = {}
         self.labels: list[str] = []
         """Labels of the corners by number; single tags are added as they are seen."""
-        for label in board.points() if board.squares is not None else ():
+        places = board.points() if board.squares is not None else {}
+        for label in places:
             self._number(label)
+        self._places = np.array(list(places.values()))[:, :2] if places else np.zeros((0, 2))
         self._charuco = _charuco_detector(board) if board.kind == "charuco" else None
         self._tags = _tag_detector(board) if board.tags else None
 
@@ -66,7 +69,7 @@ class Finder:
         if self.board.mirrored:
             print_ = np.ascontiguousarray(print_[:, ::-1])
         if self._charuco is not None:
-            numbers, pixels = self._find_charuco(print_)
+            numbers, pixels = self._find_charuco(print_, rough)
         elif self._tags is not None:
             numbers, pixels = self._find_tags(print_)
             pixels = pixels if rough else self._measured(print_, pixels)
@@ -81,21 +84,35 @@ class Finder:
             numbers = self._mirrored(numbers)
         return numbers, pixels
 
-    def refine(self, grey: Grey, corners: Corners) -> Corners:
-        """The corners again in a larger image, at most half a window from ``corners``, which are in its pixels."""
+    def refine(self, grey: Grey, corners: Corners, found_px: float = 1.0) -> Corners:
+        """The corners again, near ``corners``, which are in the image's pixels.
+
+        found_px: size of a pixel of the image in which they were found.
+        """
         numbers, pixels = corners
         if not len(numbers):
             return corners
-        share = _SUBPIX_SHARE if self.board.kind == "chessboard" else _SUBPIX_SHARE_OF_TAGS
-        half = int(np.clip(share * self.pitch(corners), _SUBPIX_LEAST, _SUBPIX_MOST))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
         # Finders extrapolate grids to beyond the image, where OpenCV refuses to begin.
         begin = np.clip(pixels, 0.0, np.subtract(grey.shape[::-1], 1)).astype(np.float32).reshape(-1, 1, 2)
-        found = cv2.cornerSubPix(grey, begin, (half, half), (-1, -1), criteria)
-        refined = np.asarray(found, dtype=np.float64).reshape(-1, 2)
-        moved = np.linalg.norm(refined - pixels, axis=1) < 1.5 * half
-        refined = np.where(moved[:, None], refined, pixels)
+        halves, refined = self._half_windows(corners), np.zeros_like(pixels)
+        for half in np.unique(halves).tolist():
+            found = cv2.cornerSubPix(grey, begin[halves == half], (half, half), (-1, -1), criteria)
+            refined[halves == half] = np.reshape(found, (-1, 2))
+        # In windows of 5 px some end at another edge, 1 to 3 px away; OpenCV's ChArUco corners are less than 1 px off.
+        most = 1.5 * halves if self._charuco is None else np.maximum(0.5 * halves, found_px)
+        near = np.linalg.norm(refined - pixels, axis=1) < most
+        refined = np.where(near[:, None], refined, pixels)
         return numbers, self._measured(np.asarray(255 - grey if self.board.inverted else grey, np.uint8), refined)
+
+    def _half_windows(self, corners: Corners) -> Ints:
+        """Half sides (n,) [px] of square windows around the corners with nothing but the four squares there."""
+        if self._charuco is None:
+            share = _SUBPIX_SHARE if self.board.kind == "chessboard" else _SUBPIX_SHARE_OF_TAGS
+            half = np.full(len(corners[0]), share * self.pitch(corners))
+        else:
+            half = _distance_of_markers(self._places[corners[0]], corners[1], self.board.ratio) - _SUBPIX_MARGIN
+        return np.asarray(np.clip(half, _SUBPIX_LEAST, _SUBPIX_MOST).astype(np.int64))
 
     def _measured(self, print_: Grey, pixels: Floats) -> Floats:
         """Corners (n, 2) of tags, four each, where lines along their sides meet; those of other boards as they are."""
@@ -118,12 +135,14 @@ class Finder:
             self.labels.append(label)
         return self._numbers[label]
 
-    def _find_charuco(self, grey: Grey) -> Corners:
+    def _find_charuco(self, grey: Grey, rough: bool) -> Corners:
         assert self._charuco is not None
         corners, ids, _, _ = self._charuco.detectBoard(grey)
         if ids is None or not len(ids):
             return NOTHING
-        return np.asarray(ids, dtype=np.int64).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+        numbers, pixels = np.asarray(ids, dtype=np.int64).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+        # OpenCV's windows reach as far as the markers' corners are, to the corners of a square: into the markers.
+        return (numbers, pixels) if rough else self.refine(grey, (numbers, pixels))
 
     def _find_tags(self, grey: Grey) -> Corners:
         assert self._tags is not None
@@ -199,6 +218,19 @@ class Finder:
             return np.asarray(4 * (row * columns + columns - 1 - column) + np.array([1, 0, 3, 2])[corner])
         row, column = np.divmod(numbers, columns - 1)
         return np.asarray(row * (columns - 1) + columns - 2 - column)
+
+
+def _distance_of_markers(places: Floats, pixels: Floats, ratio: float) -> Floats:
+    """Larger of the distances across and down (n,) [px] from each corner of a ChArUco board to the nearest marker.
+
+    places: (n, 2) of the corners [squares]. ratio: side of a marker over that of a square.
+    """
+    steps, shifts = (values[None] - values[:, None] for values in (places, pixels))
+    weights = 1.0 / np.maximum((steps**2).sum(axis=2), 1e-9) ** 2  # of the nearest corners for the map around one
+    weighted = (weights[..., None] * steps).swapaxes(1, 2)
+    by_step = np.linalg.pinv(weighted @ steps) @ weighted @ shifts  # (n, 2, 2): pixels a square across and down
+    diagonals = 0.5 * (1.0 - ratio) * np.array([[1.0, 1.0], [1.0, -1.0]])
+    return np.asarray(np.abs(diagonals @ by_step).max(axis=2).min(axis=1))
 
 
 def chessboard_of_any_size(grey: Grey, least: int) -> Floats | None:

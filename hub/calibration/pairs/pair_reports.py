@@ -53,6 +53,7 @@ def isolated_pair_report(pair: PairSolution, prepared: PreparedSession) -> PairR
     if matrix is None:
         lenses = [prepared.camera(name).intrinsics.matrix for name in (pair.a, pair.b)]
         matrix = fundamental_from(fit.geometry, *lenses)
+    stds = (std / prepared.time_scale(pair.a) for std in (fit.total_lag_std, fit.lag_std))
     return PairReport(
         (pair.a, pair.b),
         pair.status,
@@ -61,6 +62,7 @@ def isolated_pair_report(pair: PairSolution, prepared: PreparedSession) -> PairR
         matrix,
         fit.inliers,
         fit.residual_px,
+        next(filter(np.isfinite, stds), None),
         pair.acceptance,
     )
 

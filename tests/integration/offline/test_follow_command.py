@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -75,6 +76,19 @@ def test_the_report_is_one_file_that_loads_nothing(followed: Path) -> None:
     for title in ("Paths over the ground", "Identities over time", "Coverage of each camera", "Scores"):
         assert f"<h2>{title}</h2>" in page
     assert "http" not in page.replace("http-equiv", "")
+
+
+def test_the_plan_is_seen_along_the_vertical_that_people_show_where_none_is_given(
+    session: Path, tmp_path: Path
+) -> None:
+    """It was drawn along the world's z, which of a calibration without metadata is a camera's optical axis."""
+    calibration, count = re.subn(r"up = \[[^]]*\]", "", (session / "calibration.toml").read_text(encoding="utf-8"))
+    assert count == 1
+    (tmp_path / "calibration.toml").write_text(calibration, encoding="utf-8")
+    given = ["--calibration", str(tmp_path / "calibration.toml"), "--out", str(tmp_path / "out")]
+    assert run(["follow", str(session), *given]) == 0
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "ahead" in page  # not y, which is horizontal by a fraction of a degree only
 
 
 def test_rows_at_another_rate_and_json(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
+from edge.detectors.board.description import Board
+from edge.detectors.board.detector import BoardDetector
 from protocols.geometry.camera import Intrinsics
 from tests.support import boards
 
@@ -76,6 +78,19 @@ def test_intrinsics_are_estimated_from_a_board(
     assert np.sqrt(np.mean((again - pixels) ** 2)) < 1.0
 
 
+def test_small_squares_at_the_rim_of_a_fisheye_have_no_corner_at_another_edge() -> None:
+    """In windows of 5 px the iteration ends up to 3 px away."""
+    board = next(iter(Board("charuco", boards.SQUARES, inverted=False, mirrored=False).prints()))
+    places = np.array(list(board.points().values())) - [0.5 * boards.SQUARES[0], 0.5 * boards.SQUARES[1], 0.0]
+    off = []
+    for rotation, centre in boards.board_poses(10, 4, reach=0.9):
+        image = renderer(True).draw(boards.charuco_image(), rotation, 0.55 * centre)
+        numbers, pixels = BoardDetector(board, 1.0).find(image[..., 0].copy())
+        off.append(pixels - FISHEYE.project(places[numbers] @ rotation.T + 0.55 * centre))
+    assert sum(map(len, off)) > 300
+    assert np.abs(np.concatenate(off)).max() < 1.0
+
+
 def test_other_cameras_and_keys_of_the_rig_file_are_kept(tmp_path: Path) -> None:
     out = tmp_path / "rig.toml"
     before = (
@@ -107,14 +122,22 @@ def test_a_board_only_at_the_image_centre_is_refused(tmp_path: Path, capsys: Cap
 
 def test_a_few_views_give_a_lens_with_its_std(tmp_path: Path, capsys: Capture) -> None:
     video = render_board(tmp_path / "some", "charuco", False, count=5)
-    cv2.imwrite(str(video / "empty.bmp"), np.full_like(cv2.imread(str(video / "000.bmp")), 128))
+    first = cv2.imread(str(video / "000.bmp"))
+    assert first is not None
+    cv2.imwrite(str(video / "empty.bmp"), np.full_like(first, 128))
+    cv2.imwrite(str(video / "emptier.bmp"), np.full_like(first, 120))
+    first[:, 330:] = 128  # about the middle of the board, which is in the middle
+    cv2.imwrite(str(video / "half.bmp"), first)
     assert run(command(video, tmp_path / "rig.toml", "charuco")) == 0
     report = json.loads(capsys.readouterr().out)
     table = tomllib.loads((tmp_path / "rig.toml").read_text())["some"]
     assert 0.005 < table["focal_std"] < 0.05
     assert abs(table["matrix"][0][0] / PINHOLE.focal - 1) < 3 * table["focal_std"]
     assert report["views"] == 5
-    assert report["warnings"][0].startswith("1 of 6 photographs are not used: no board, ")
+    (warning,) = report["warnings"]
+    assert warning.startswith(
+        "3 of 8 photographs are not used: 2 without the board, 1 with fewer than 8 of its corners"
+    )
 
 
 def test_an_inverted_board_is_found_without_a_setting(tmp_path: Path, capsys: Capture) -> None:
@@ -130,7 +153,9 @@ def test_few_views_or_none_are_refused(tmp_path: Path, capsys: Capture) -> None:
     assert run(command(video, tmp_path / "rig.toml", "charuco")) == 3
     assert "2 different views, 3 give an approximate lens, 8 a good one" in capsys.readouterr().err
     assert run([*command(video, tmp_path / "rig.toml", "charuco"), "--dictionary", "6X6_50"]) == 3
-    assert "in no frame" in capsys.readouterr().err
+    report = capsys.readouterr().err
+    assert "in no frame" in report
+    assert "2 of 2 photographs are not used: 2 without the board" in report
 
 
 def test_images_of_other_sizes_are_named(tmp_path: Path, capsys: Capture) -> None:

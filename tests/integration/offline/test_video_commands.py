@@ -22,6 +22,8 @@ from deploy.cli import run
 from edge.devices.playback.video_reader import VideoReader
 from edge.offline.detections import HEADER
 from edge.scenes.marker.scene import MarkerScene
+from protocols.core.acceptance import PairReport
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from tests.support.sounds import add_sound, heard, sound_events
 from tests.support.videos import Image, numbered_image, read_number, record_scene_videos, write_video
@@ -161,6 +163,9 @@ def test_a_single_video_is_refused_at_once(tmp_path: Path, capsys: Capture) -> N
     write_video(tmp_path / "videos" / "a.mp4", [numbered_image(0)] * 3, np.arange(3) / 20)
     assert run(["calibrate", str(tmp_path / "videos"), "--out", str(tmp_path / "out")]) == 2
     assert "a.mp4" in capsys.readouterr().err
+    shutil.copy(tmp_path / "videos" / "a.mp4", tmp_path / "videos" / "b.mp4")
+    assert run(["calibrate", str(tmp_path / "videos"), "--out", str(tmp_path / "out")]) == 2
+    assert "b.mp4 is the same video as a.mp4" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -406,7 +411,9 @@ def test_two_cameras_without_lenses_are_synchronised_by_timing_alone(
     folder, out, _ = without_lenses
     arguments = ["sync", str(folder), "--videos", "none", "--json"]
     assert run([*arguments, "--calibration", str(out / "result.json"), "--out", str(tmp_path / "sync")]) == 0
-    assert json.loads(capsys.readouterr().out)["reference"] == "cam0"
+    report = json.loads(capsys.readouterr().out)
+    assert report["reference"] == "cam0"
+    assert 0.0 < report["time_offset_std"]["cam1"] < 0.002
     shutil.copytree(out / "session", tmp_path / "again" / "session")  # what `calibrate` detected
     assert run([*arguments, "--out", str(tmp_path / "again")]) == 0  # without a calibration: it is made
     with_poses = toml(recorded.out / "calibration.toml")["cam1"]
@@ -414,6 +421,23 @@ def test_two_cameras_without_lenses_are_synchronised_by_timing_alone(
         for row in rows(tmp_path / made / "cam1.csv"):
             expected = with_poses["clock_rate"] * float(row["time"]) + with_poses["time_offset"]
             assert abs(float(row["reference_time"]) - expected) < 0.005
+
+
+def test_lags_that_are_not_known_are_refused_as_such_and_not_for_want_of_lenses(
+    without_lenses: tuple[Path, Path, str], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, out, _ = without_lenses
+    shutil.copytree(out / "session", tmp_path / "sync" / "timing" / "session")
+
+    def refuse(*_: object, **__: object) -> None:
+        pairs = (PairReport(("cam0", "cam1"), "two alignments are about as good"),)
+        raise Refused("fewer than two cameras can be placed; give their intrinsics", pairs=pairs)
+
+    monkeypatch.setattr("hub.api.calibrate", refuse)
+    assert run(["sync", str(folder), "--videos", "none", "--out", str(tmp_path / "sync")]) == 3
+    message = capsys.readouterr().err
+    assert "the lag of no pair of these videos is known (cam0 and cam1: two alignments are about as good)" in message
+    assert "intrinsics" not in message
 
 
 def test_videos_in_which_nothing_moves_are_synchronised_by_their_sounds(tmp_path: Path, capsys: Capture) -> None:
