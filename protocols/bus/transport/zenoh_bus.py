@@ -413,8 +413,8 @@ class ZenohSubscription(InboxSubscription):
 
     def flush(self) -> None:
         """Queue what was fetched and what waits for it."""
-        if self._open_histories:
-            self._read_histories()
+        if self._open_queries:
+            self._read_replies()
         self._backfill.flush()
         self.inbox.push_all(self._arrived)
 
