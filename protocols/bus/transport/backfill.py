@@ -164,9 +164,12 @@ class Backfill(Generic[_Source]):
     def heartbeat(self, source: _Source, key: str, number: int) -> None:
         """A publisher has said that ``number`` is its newest message: if that doesn't arrive, query it."""
         who, now = (key, source), self._clock()
+        if who not in self._next:  # nothing came of it yet, or its history was empty
+            self.appeared(source, key)
+            return
         with self._lock:
-            expected = self._next.get(who)
-            if expected is None or who in self._held:
+            expected = self._next.get(who, number + 1)
+            if who in self._held:
                 return
             if (number - expected) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2:
                 self._behind.pop(who, None)
@@ -198,9 +201,12 @@ class Backfill(Generic[_Source]):
             if held is None or held.question != query.number:
                 return
             follow: RecoveryQuery[_Source] | None = None
-            part = sum(query.low <= number <= query.high for number in held.early)
-            if query.most is not None and served and part >= query.most and min(held.early) > held.low:
-                held.high = min(held.early) - 1
+            part = [number for number in held.early if query.low <= number <= query.high]
+            missing = max(part, default=query.high)
+            while missing in held.early:  # of a larger part, which broke off, there may be more further below
+                missing -= 1
+            if query.most is not None and served and len(part) >= query.most and query.high > missing >= held.low:
+                held.high = missing
                 follow = self._question(who, held)
             elif held.joining and served and not part and query.witness is None and held.later:
                 follow = self._question(who, held)  # now there is a witness: did the connection break?
@@ -232,6 +238,11 @@ class Backfill(Generic[_Source]):
                     queries.append(follow)
         for question in queries:
             self._ask(question)
+
+    def awaits(self, query: RecoveryQuery[_Source]) -> bool:
+        """Whether the messages of a query are still waited for."""
+        held = self._held.get((query.key, query.source))
+        return held is not None and held.question == query.number
 
     def flush(self) -> None:
         """Deliver all that is held back; what is missing counts as lost."""
@@ -317,6 +328,9 @@ class Backfill(Generic[_Source]):
         if held.continued and held.low < held.first:
             # The numbers went on where they had been: what was far ahead of them was another's.
             self._next[who] = held.low
+            return None
+        if held.announced is not None and not held.early and not held.later:
+            self._next[who] = held.low  # nobody has what was announced: if it was, what comes next shows it
             return None
         expected = held.first
         if held.joining:

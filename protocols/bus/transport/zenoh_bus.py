@@ -195,10 +195,10 @@ class ZenohSubscription(InboxSubscription):
         # A query waits for Zenoh's tables, which Zenoh holds while it waits for room in the channel.
         asking = map(self._ask, iter(self._questions.get, None))
         threading.Thread(target=deque, args=(asking, 0), name=f"recovery {key}").start()
+        self._heartbeats: zenoh.Subscriber[Any] | None = None
         try:
             with zenoh_call(f"watch {key}"):
                 # The oldest of too many heartbeats are dropped: each is said again.
-                self._heartbeats: zenoh.Subscriber[Any] | None = None
                 if self._reliable:
                     ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
                     self._heartbeats = session.declare_subscriber(f"{key}{_ADVANCED}**", ring)
@@ -206,7 +206,7 @@ class ZenohSubscription(InboxSubscription):
                     f"{key}{_ADVANCED}**", zenoh.handlers.Callback(self._appeared, indirect=False), history=True
                 )
         except BaseException:  # its threads would never end
-            undeclare_all(self._subscriber)
+            undeclare_all(self._heartbeats, self._subscriber)
             self._questions.put(None)
             raise
 
@@ -300,7 +300,7 @@ class ZenohSubscription(InboxSubscription):
         still_open = 1 if question.witness is None else 2
         if self._reliable:
             question = replace(question, most=self._part)
-        opened = _OpenQuery(question, time.monotonic(), deque(maxlen=question.most or _MAX_REPLIES))
+        opened = _OpenQuery(question, time.monotonic(), deque(maxlen=(question.most or _MAX_REPLIES) + 1))
         if self._reliable:
             with lock:
                 if not self._may_ask(question):
@@ -345,6 +345,8 @@ class ZenohSubscription(InboxSubscription):
                 # Sent after the other query on the same route: if this one is answered, so was that one.
                 get(question.witness, question.witness, witnessed)
         except BusDead:
+            with lock:
+                self._open_queries.pop(question.number, None)
             self._backfill.finish(question, served=False)
             self.inbox.push_all(self._arrived)
 
@@ -352,7 +354,9 @@ class ZenohSubscription(InboxSubscription):
         """Ask for more at once, or less, by how much longer than the fastest answer one took: it waited on the link."""
         self._fastest_s = min(self._fastest_s, seconds)
         waited = seconds - self._fastest_s
-        if waited > _LONGEST_WAIT_S:
+        if waited > _LONGEST_WAIT_S and self._part == _LEAST_PART:
+            self._fastest_s = seconds  # a smaller part is no faster: the way there and back takes as long
+        elif waited > _LONGEST_WAIT_S:
             self._part = max(self._part // 2, _LEAST_PART)
         elif waited < 0.5 * _LONGEST_WAIT_S and most == self._part:
             self._part = min(2 * self._part, MOST_PART)
@@ -364,6 +368,7 @@ class ZenohSubscription(InboxSubscription):
     def _ask_next(self) -> None:
         """Of the queries that wait, the first whose turn it is."""
         with self._counting:
+            self._waiting = deque(filter(self._backfill.awaits, self._waiting))
             if (following := next(filter(self._may_ask, self._waiting), None)) is not None:
                 self._waiting.remove(following)
                 self._questions.put(following)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from protocols.bus.transport.backfill import (
     GAP_TIMEOUT_S,
     HISTORY_TIMEOUT_S,
@@ -378,13 +380,50 @@ def test_the_last_message_before_a_pause_is_asked_for_by_its_heartbeats() -> Non
 
 def test_who_has_sent_all_that_its_heartbeats_announce_is_not_asked() -> None:
     stage = Stage()
-    for number in range(4):  # each arrives after the heartbeat that announces it
+    stage.take("a", 0)
+    for number in range(1, 5):  # each arrives after the heartbeat that announces it
         stage.backfill.heartbeat("a", "key-a", number)
         stage.take("a", number)
         stage.now += PATIENCE_S
         stage.backfill.heartbeat("a", "key-a", number)
-    stage.backfill.heartbeat("b", "key-b", 9)  # its token has not come yet
     assert stage.asked == []
+
+
+def test_who_had_nothing_when_it_appeared_is_asked_again_at_its_heartbeats() -> None:
+    stage = Stage()
+    stage.backfill.appeared("a", "key-a")
+    stage.answer()
+    stage.backfill.heartbeat("a", "key-a", 2)
+    stage.answer(0, 1, 2)
+    assert stage.out == names(0, 1, 2)
+
+
+def test_a_forged_heartbeat_loses_and_silences_nothing() -> None:
+    stage = Stage()
+    stage.take("a", 0, 1)
+    for _ in range(2):
+        stage.backfill.heartbeat("a", "key-a", 2**31)
+        stage.now += PATIENCE_S
+    stage.after(GAP_TIMEOUT_S + 1.0)
+    stage.take("a", 2, 3)
+    assert (stage.out, stage.lost) == (names(0, 1, 2, 3), 0)
+
+
+def test_of_a_part_that_broke_off_nothing_is_lost_by_a_smaller_one() -> None:
+    """A cache answers in ascending order: what came of the larger part is its old end."""
+    stage = Stage()
+    stage.take("a", 0, 601)
+    query = stage.asked[-1]
+    for number in range(89, 120):
+        stage.backfill.answer(query, number, query.key, f"a{number}".encode())
+    stage.backfill.finish(query, served=False)
+    stage.after(RETRY_S)
+    while len(stage.out) == 1:
+        query = replace(stage.asked[-1], most=256)
+        for number in range(max(query.high - 255, query.low), query.high + 1):
+            stage.backfill.answer(query, number, query.key, f"a{number}".encode())
+        stage.backfill.finish(query, served=True)
+    assert (stage.out, stage.lost) == (names(*range(602)), 0)
 
 
 def test_a_gap_is_fetched_in_parts_the_newest_first() -> None:
