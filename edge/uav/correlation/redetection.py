@@ -33,7 +33,7 @@ _MIN_INSIDE = 0.6  # share of a place in the image
 TRIAL_SIZES = (0.9, 1.1)  # factors on the sides: they move the box's border by a third of a template's cell
 _FIRST_SIZES = (0.7, 0.84, 1.2, 1.4)  # of a place that is tested for the first time
 _TRIAL_TURNS, _FIRST_TURNS = (-0.1, 0.1), (-0.36, -0.18, 0.18, 0.36)  # [rad]
-_SIZES = (1.0, 0.87, 1.15, 0.75, 1.33)  # factors on the sides, one a search: a target comes back nearer or farther away
+_SIZES = (1.0, 0.87, 1.0, 1.15, 1.0, 0.75, 1.0, 1.33)  # factors on the sides, one a search: it comes back nearer or not
 _UPRIGHT = float("nan")  # as in the first image, however it had turned: most targets only seem to turn
 _ANGLES = (0.0, _UPRIGHT, 0.35, 0.0, -0.35, _UPRIGHT, 0.7, 0.0, -0.7, _UPRIGHT, 1.1, 0.0, -1.1, _UPRIGHT, 1.57)
 
@@ -113,15 +113,14 @@ class Redetection:
 
     def _search(self, image: Image, expected: Prediction, dt: float) -> None:
         """Take up the likeliest new place: in turn about the prediction, and in one tile after the other."""
-        box, turn = expected.box, expected.frames // 2
-        angle = _ANGLES[turn % len(_ANGLES)]
-        box = box.sized(box.sides * _SIZES[turn % len(_SIZES)]).turned(-box.angle if np.isnan(angle) else angle)
-        reach = max(3.0 * expected.std, 2.0 * expected.wide) + 0.3 * box.sides
-        if expected.frames % 2:
-            box, reach = tile(box, self._size, turn)
+        box, number = expected.box, expected.frames
+        if number % 2:
+            found = search(image, self._memory, *tile(_view(box, number // 2), self._size, number // 2))
         else:
             self._find_nothing(expected)
-        found = search(image, self._memory, box, reach)
+            reach = max(3.0 * expected.std, 2.0 * expected.wide)
+            views = _view(box, number), _view(box, number + 1)  # who drives through a bend may have turned by any angle
+            found = [f for view in views for f in search(image, self._memory, view, reach + 0.3 * view.sides)]
         moving = [box.at(place) for place in self._moving.peaks(box.extent, _MOST_MOVING)]
         found += [Found(place, self._memory.score(image, place)) for place in moving]
         new = [f for f in found if not any(c.covers(f.box) for c in self._tested)]
@@ -178,6 +177,12 @@ class Redetection:
         cues = answer.log_ratio + self._moving.log_ratio(box.centre)
         candidate.add(box, self._memory.log_ratio(score, _CHANGE, cues) + self._colour.log_ratio(image, box), dt)
         return candidate.promising and box.share_inside(self._size) > _MIN_INSIDE
+
+
+def _view(box: OrientedBox, number: int) -> OrientedBox:
+    """The box at one of the sizes and angles that are tried in turn."""
+    angle = _ANGLES[number % len(_ANGLES)]
+    return box.sized(box.sides * _SIZES[number % len(_SIZES)]).turned(-box.angle if np.isnan(angle) else angle)
 
 
 def _log_density(squared: float, std: float, area: float) -> float:

@@ -221,6 +221,25 @@ def test_a_target_is_predicted_while_the_camera_looks_away_and_found_again(scene
     assert error[-15:].max() < 4.0
 
 
+@pytest.mark.parametrize("angle", [0.6, 1.1, -1.2])
+def test_a_target_that_turned_while_it_was_away_is_found_soon(scene: Image, angle: float) -> None:
+    place, size = (310.0, 320.0), scene.shape[1::-1]
+    rotation = cv2.getRotationMatrix2D(place, -np.degrees(angle), 1.0)
+    still, mask = scene.copy(), np.zeros_like(scene)
+    paint(still, *place)
+    cv2.rectangle(mask, (293, 309), (326, 330), (1, 1, 1), -1)
+    turned = np.where(cv2.warpAffine(mask, rotation, size) > 0, cv2.warpAffine(still, rotation, size), scene)
+    share = np.clip((np.arange(60) - 20) / 6, 0, 1) - np.clip((np.arange(60) - 36) / 6, 0, 1)
+    images = []
+    for k, x in enumerate((150 + 420 * share).astype(int)):
+        window = (turned if k > 30 else still)[200 : 200 + SIZE[1], x : x + SIZE[0]]
+        noise = np.random.default_rng(k).integers(0, 6, window.shape, np.uint8)
+        images.append(cv2.add(np.ascontiguousarray(window), noise))
+    last = follow(images, np.array(place) - [150.0, 200.0])[-1]
+    assert last.state is TrackState.VISIBLE
+    assert [last.x, last.y] == pytest.approx([160.0, 120.0], abs=8.0)
+
+
 def test_a_target_that_does_not_return_is_never_claimed(scene: Image) -> None:
     images, truth = flight(scene, away=420.0, shown_again=False)
     assert not any(e.state is TrackState.VISIBLE for e in follow(images, truth[0])[30:])
