@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -73,7 +73,7 @@ def read_time_maps(
     try:
         document = json.loads(read_text(file))
         pairs = [
-            (str(a), str(b), float(pair["lag_s"]), float(pair.get("clock_rate") or 1.0), pair.get("lag_std_s"))
+            (str(a), str(b), float(pair["lag_s"]), float(pair.get("clock_rate") or 1.0), _lag_std(pair))
             for pair in document["pairs"]
             if pair.get("lag_s") is not None
             for a, b in (pair["cameras"],)
@@ -83,6 +83,12 @@ def read_time_maps(
         remedy = "give the result.json or the calibration.toml of `calibrate`"
         raise InputError("this is no result of `calibrate`", file=file, remedy=remedy) from None
     return *time_maps_of_pairs(pairs, films), refused
+
+
+def _lag_std(pair: Mapping[str, Any]) -> float | None:
+    """Of the lag of a pair of a result.json [s], None where it is not known. Raises ValueError, TypeError."""
+    std = pair.get("lag_std_s")
+    return float(std) if std is not None and 0.0 <= float(std) < math.inf else None
 
 
 def time_maps_of_pairs(

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -88,6 +89,9 @@ class _ClockState:
     """(first sequence, name)"""
     last: tuple[int, int, float, float | None] | None = None
     """(sequence, frame, device time [s], arrival [s])"""
+    pause: tuple[float, float, float, float, list[tuple[float, float]]] | None = None
+    """Of a jump forward that was taken for one: until when [s] a frame of less delay than this [s] shows it a step, of
+    this size and std [s], after these bins"""
     periods: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_PERIODS))
     bins: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_MAX_BINS))
     """(device time, arrival - device time) of the lowest-delay frame of each half second; the last bin is incomplete"""
@@ -182,7 +186,7 @@ class ClockChangeDetector:
     ) -> ClockChange | None:
         if clock.last is None:
             return None
-        _, last_frame, last_time, _ = clock.last
+        _, last_frame, last_time, last_arrival = clock.last
         elapsed, frames = time - last_time, frame - last_frame
         if frames > 0 and 0.0 < elapsed < MIN_STEP_S + 1.0 and len(clock.periods) < 5:
             clock.periods.append(elapsed / frames)
@@ -202,17 +206,29 @@ class ClockChangeDetector:
             spread = max(1.5 * float(np.median(np.abs(np.array(clock.periods) - period))), 1e-4)
             # The error of the period, which is a median, grows with every frame that is missing.
             std = spread * math.hypot(math.sqrt(frames), frames * math.sqrt(0.5 * math.pi / len(clock.periods)))
-            if abs(step) < _STEP_SIGMAS * std or self._has_usual_delay(clock, time, arrival, step):
+            clock.pause = None
+            if abs(step) < _STEP_SIGMAS * std:
                 return None
-            if 0.0 < step < _LONGEST_PAUSE_S and (waited or self._is_fetched(clock, last_time, arrival)):
+            if 0.0 < step < _LONGEST_PAUSE_S and (waited or self._is_fetched(clock, last_time, last_arrival)):
                 return None  # as likely frames that the camera did not count
             earlier = list(clock.bins)[-1 - _MAX_PRESTEP_BINS : -1] if arrival is not None else []
-            change = self._start_segment(clock, camera, "step", sequence, step, std)
-            if len(earlier) >= _MIN_PRESTEP_BINS:
-                level, slope, sigma = fit_line(np.array(earlier))
-                clock.refinement = StepEstimator(len(self._changes), step, change.step_std_s, (level, slope), sigma)
-            return change
+            if not self._has_usual_delay(clock, time, arrival, step):
+                return self._start_segment(clock, camera, "step", sequence, step, std, earlier=earlier)
+            delays = [delay for _, delay in earlier]
+            if step > 0.0 and len(delays) >= _FETCHED_BINS:
+                # A late frame looks alike if the clock was set; those after it show which it was. Less delay than ever
+                # by more than links vary, of which the queue of an outage may be drained yet, no pause explains.
+                least = min(delays)
+                earliest = least - max(MIN_STEP_S, 0.5 * step, float(np.median(delays)) - least)
+                clock.pause = time + _USUAL_BINS * _BIN_S, earliest, step, std, earlier
+            return None
         clock.periods.append(elapsed / frames)
+        if clock.pause is not None and arrival is not None:
+            until, earliest, step, std, earlier = clock.pause
+            if time > until:
+                clock.pause = None
+            elif arrival - time < earliest:
+                return self._start_segment(clock, camera, "step", sequence, step, std, earlier=earlier)
         return None
 
     @staticmethod
@@ -304,8 +320,10 @@ class ClockChangeDetector:
         if refinement.count >= _RATE_REFINEMENT_BINS:
             clock.refinement = None
             if abs(refinement.recent_slope) < _FALSE_ALARM_SHARE * abs(refinement.first_slope_change):
-                # The delays have changed, and the clock as little as another route changes it.
-                self._changes[refinement.change_index] = replace(change, rate_change=0.0, step_s=0.0)
+                # Another route, or a slew that has ended and moved the clock by as much: the delays cannot tell.
+                std = math.hypot(change.step_std_s, np.mean([excess for _, excess in refinement.recent]))
+                change = replace(change, rate_change=0.0, step_s=0.0, step_std_s=std)
+                self._changes[refinement.change_index] = change
                 for span in (WINDOW_BINS[0], WINDOW_BINS[-1]):
                     seen = clock.slope_power.get(span, 0.0)
                     clock.slope_power[span] = seen + _FALSE_ALARM_WEIGHT * (refinement.first_slope_change**2 - seen)
@@ -319,13 +337,18 @@ class ClockChangeDetector:
         step: float,
         std: float,
         rate_change: float = 0.0,
+        earlier: Sequence[tuple[float, float]] = (),
     ) -> ClockChange:
+        """earlier: bins before a step, by which it is refined where there are enough."""
         previous, first = clock.segments[-1][1], clock.segments[0][1]
         suffix = f"-e{len(clock.segments)}"
         name = first[: _MAX_NAME_LENGTH - len(suffix)] + suffix
         clock.segments.append((sequence, name))
         clock.bins.clear()
-        clock.line, clock.delay_power, clock.refinement = None, 0.0, None
+        clock.line, clock.delay_power, clock.refinement, clock.pause = None, 0.0, None, None
+        if len(earlier) >= _MIN_PRESTEP_BINS:
+            level, slope, sigma = fit_line(np.array(earlier))
+            clock.refinement = StepEstimator(len(self._changes), step, float(std), (level, slope), sigma)
         return ClockChange(camera, kind, previous, name, step, float(std), rate_change)
 
 

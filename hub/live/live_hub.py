@@ -50,6 +50,7 @@ _VERIFY_EVERY_S = 0.5  # s: between two tests of a reloaded answer
 _CHECK_EVERY_S = 60.0  # s: between two tests of a given calibration, which take a second or two
 _BUDGET_NOTICE_S = 10.0
 """How long the status names a camera that exceeded its budget."""
+_UNSEEN = "pose and clock are of an earlier answer, no detections since"
 _MAX_STD_GROWTH = 1.5
 """An answer whose stds are larger than the present one's by this factor is not taken: its rows say less."""
 
@@ -229,7 +230,8 @@ class LiveHub:
             self._pixel_faults.pop(name, None)
         if self.calibration is not None:
             left = {name: why for name, why in self.calibration.refused.items() if name not in names}
-            self.calibration = replace(self.calibration, refused=left)
+            warnings = tuple(one for one in self.calibration.warnings if not one.endswith(_UNSEEN))
+            self.calibration = replace(self.calibration, refused=left, warnings=warnings)
             self._clock_stepped = True  # published with the next tick
         return names
 
@@ -459,7 +461,8 @@ class LiveHub:
     def _submit(self, now: float, final: bool) -> list[Message]:
         """Hand the present observations to the solver; a final job searches for every camera that is not tied."""
         try:
-            rig, observations = self._without_other_pixels(*self._build_session())
+            heard, observations = self._build_session()
+            rig, observations = self._without_other_pixels(heard, observations)
         except Refused as refusal:
             self.refusal = refusal
             return []
@@ -489,11 +492,17 @@ class LiveHub:
         )
         if not self.unverified:
             self._reloaded = None  # there are enough rows for an answer of their own
+        start = last if self._reloaded is None else self._reloaded.on_clocks(boots)
+        if start is not None:  # what is left out may have been moved: only what is not heard stays as it was
+            kept = {
+                name: one for name, one in start.cameras.items() if name in rig.cameras or name not in heard.cameras
+            }
+            start = replace(start, cameras=kept)
         job = SolverJob(
             self._jobs + 1,
             rig,
             observations,
-            last if self._reloaded is None else self._reloaded.on_clocks(boots),
+            start,
             search,
             full,
             self._reloaded is not None,
@@ -604,9 +613,8 @@ class LiveHub:
         self._reloaded = None
         self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
         self.session = job.rig, job.observations
-        if unheard := found.cameras.keys() - job.rig.cameras.keys():
-            why = f"{listed(sorted(unheard))}: pose and clock are of before the hub was started, not heard since"
-            found = replace(found, warnings=(*found.warnings, why))
+        if unseen := found.cameras.keys() - set(job.observations.cameras):
+            found = replace(found, warnings=(*found.warnings, f"{listed(sorted(unseen))}: {_UNSEEN}"))
         if job.last is None and self.calibration is not None and self.tracking is not None and not self.is_shard:
             self.tracking = LiveTracking()  # in another world frame
         self._report_steps(found)

@@ -177,7 +177,8 @@ def _pictures(
 ) -> Iterator[tuple[int, Image, float]]:
     """Frame number, picture, and its size over that of the frame in which was detected. width: of that frame [px].
 
-    A video's frames are those of the same number, and where the detections are not numbered, of the same time.
+    A video's frames are those of the same number, counted from 0, or from 1 where the times of all detections say so,
+    and where the detections are not numbered, of the same time.
     """
     missing = set(wanted)
     mine = [message for message in source.observations if message.camera == camera]
@@ -188,8 +189,10 @@ def _pictures(
         scale, near_s = video.info.size[0] / width, 0.5 / video.info.fps
         numbered = all(message.frame == message.sequence for message in mine)
         times = np.array([message.device_time_ns / NANOSECONDS for message in mine])
+        counted = np.array([message.sequence for message in mine])
+        from_one = counted.min() > 0 and (np.abs(times - (counted - 1) / video.info.fps) < near_s).all()
         for frame in video:
-            sequence = frame.frame
+            sequence = frame.frame + int(from_one)
             if not numbered:
                 nearest = int(np.argmin(np.abs(times - frame.time)))
                 sequence = mine[nearest].sequence if abs(times[nearest] - frame.time) <= near_s else -1

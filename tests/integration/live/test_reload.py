@@ -14,9 +14,9 @@ from deploy.agents.answer_store import HISTORY, LAST, AnswerStore
 from deploy.agents.assembly import write_last
 from hub.live.live_hub import LiveHub, LiveSettings
 from hub.live.scheduled_hub import ScheduledHub
-from hub.live.solver import SolverJob
+from hub.live.solver import JobSchedule, SolverJob
 from protocols.core.clocks import NANOSECONDS, TimeMap
-from protocols.core.errors import Refused
+from protocols.core.errors import InputError, Refused
 from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import read_calibration
@@ -152,6 +152,8 @@ def test_a_camera_that_is_not_heard_keeps_its_pose_over_two_restarts(
     for file in ("calibration.toml", "current.toml"):
         pose = read_calibration(tmp_path / file)[1]["cam1"].pose
         assert pose.position == pytest.approx(before[0].cameras["cam1"].pose.position, abs=1e-9)
+    assert hub.forget_silent(20.0) == ["cam1"]
+    assert hub.calibration.warnings == ()
 
     again = restarted(tmp_path)
     play(again, session, 20.0, 24.0)
@@ -173,6 +175,23 @@ def test_a_camera_that_comes_back_goes_on_from_its_pose(session: Session, kept: 
     assert hub.state(24.0) == ("calibrated", "3 cameras calibrated")
     clock = hub.calibration.cameras["cam1"].time_map
     assert abs(session.clock_error("cam1", hub.calibration.reference, clock)) < 1e-3
+
+
+@pytest.mark.parametrize("by", ["pixels", "failures"])
+def test_a_camera_that_is_heard_and_left_out_of_the_job_is_not_calibrated(
+    session: Session, by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was "calibrated", and "not heard since"."""
+    hub = LiveHub(SETTINGS)
+    play(hub, session, 0.0, 16.0)
+    if by == "pixels":
+        monkeypatch.setattr("hub.live.live_hub.pixel_faults", lambda *_: {"cam1": InputError("beyond its image")})
+    else:
+        monkeypatch.setattr(JobSchedule, "readmit", lambda schedule, _: setattr(schedule, "left_out", "cam1"))
+    play(hub, session, 16.0, 20.0)
+    assert hub.calibration is not None
+    assert (set(hub.calibration.cameras), hub.calibration.warnings) == ({"cam0", "cam2"}, ())
+    assert [one.state for one in hub.progress()] == ["calibrated", "searching", "calibrated"]
 
 
 def test_a_hub_that_finds_nothing_after_its_restart_keeps_the_files_of_before(

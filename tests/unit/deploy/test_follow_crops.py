@@ -115,6 +115,26 @@ def test_detections_without_frame_numbers_are_cut_from_the_frames_of_their_times
     assert np.median(heads) < 25
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_frames_are_counted_from_0_or_from_1_as_their_times_say(
+    first: int, filmed: FollowInput, tmp_path: Path
+) -> None:
+    """MOT files count from 1: each picture was cut out of the frame after. Nobody is in the first frame."""
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    numbered = []
+    for message in filmed.observations[1:]:
+        copy = pb.Observation()
+        copy.CopyFrom(message)
+        copy.sequence = copy.frame = message.sequence + first
+        numbered.append(copy)
+    one = replace(track(2), detections=[(CAMERA, message.sequence, 2) for message in numbered])
+    shown = replace(filmed, observations=numbered, times_ns=filmed.times_ns[1:])
+    write_crops(tmp_path / "crops", shown, result(one), known)
+    heads = off(tmp_path / "crops", "head", HEAD)
+    assert len(heads) == FRAMES - 1
+    assert np.median(heads) < 25
+
+
 def test_a_video_of_another_size_than_the_detections_is_cut_at_the_same_places(
     filmed: FollowInput, tmp_path: Path
 ) -> None:

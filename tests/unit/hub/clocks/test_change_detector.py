@@ -89,6 +89,29 @@ def test_a_late_frame_after_a_pause_is_no_step(step_ns: int, steps: int) -> None
     assert len(camera.events) == steps
 
 
+@pytest.mark.parametrize(("step_s", "late_s"), [(0.45, 0.25), (1.0, 0.55), (5.0, 2.6)])
+def test_a_step_whose_first_frame_is_late_is_found_by_those_after_it(step_s: float, late_s: float) -> None:
+    """Late by half the step, it was taken for a pause, and the step missed for good."""
+    camera = Camera()
+    camera.frames(100)
+    camera.arrival += late_s
+    camera.frames(1, step_ns=round(step_s * 1e9))
+    camera.arrival -= late_s
+    camera.frames(100)
+    (event,) = camera.events
+    assert event.step_s == pytest.approx(step_s, abs=1e-3)
+
+
+def test_a_pause_after_frames_that_came_all_at_once_is_no_step() -> None:
+    """A hub was restarted: how late the backlog came says nothing of what came after it."""
+    detector, events = ClockChangeDetector(), list[ClockChange]()
+    for number in range(300):
+        true = number / 30.0 + 5.0 * (number >= 100)
+        _, event = detector.handle("cam0", "b", number, number, round(1e9 * true), 100.0 + max(true, 6.0))
+        events += [] if event is None else [event]
+    assert events == []
+
+
 @pytest.mark.parametrize("is_told", [True, False])
 @pytest.mark.parametrize(("step_s", "steps"), [(0.45, 0), (30.0, 0), (-0.45, 1), (1.7e9, 1)])
 def test_of_frames_that_waited_for_the_hub_a_pause_is_no_step(step_s: float, steps: int, is_told: bool) -> None:
@@ -328,3 +351,18 @@ def test_an_alarm_that_the_seconds_after_do_not_confirm_is_withdrawn(late_s: flo
     (change,) = segments._detector.changes_since("cam0", "b")
     assert change.rate_change == pytest.approx(1e-6 * ppm, abs=5e-6)
     assert change.step_s == pytest.approx(0.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("ppm", [500.0, -500.0])
+@pytest.mark.parametrize("seconds", [4.0, 8.0, 15.0])
+def test_the_std_of_a_withdrawn_alarm_covers_a_slew_that_has_ended(ppm: float, seconds: float) -> None:
+    """NTP had moved the clock by 2 to 7.5 ms, and its stated std was 0.3 ms."""
+    rng, detector = np.random.default_rng(8), ClockChangeDetector()
+    for number in range(30 * 60):
+        true = number / 30.0
+        shown = true + 1e-6 * ppm * min(max(0.0, true - 25.0), seconds)
+        detector.handle("cam0", "b", number, number, round(shown * 1e9), 100.0 + true + float(rng.exponential(3e-4)))
+    (change,) = detector.changes_since("cam0", "b")
+    shift = 1e-6 * ppm * seconds
+    assert change.rate_change == 0.0
+    assert abs(shift - change.step_s) < 1.2 * change.step_std_s < 1.5 * abs(shift)
