@@ -10,7 +10,7 @@ from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats
 
-_ACCEPT = 2.0  # log odds of a re-detection
+_ACCEPT = 2.7  # log odds of a re-detection: 2, and ln 2 since each search tries two views
 _TENTATIVE = -3.0  # log odds below which a place is not tested further
 MAX_TESTS = 8  # frames for which a place is tested
 _HITS = 3  # consecutive frames of a re-detection

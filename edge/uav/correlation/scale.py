@@ -83,29 +83,27 @@ class BoxFlow:
             return none
         p, q = p[near], q[near]
         prior = _FLOW_PRIOR * max(_FLOW_GRID**2 * _INDEPENDENT / (box.width * box.height), 1.0)
-        return _shape_change(p, q, prior)
+        wider, skew = _slope(p, q[:, 0], 0, prior)
+        higher, skew_y = _slope(p, q[:, 1], 1, prior)
+        return wider, higher, 0.5 * (skew_y - skew)
 
 
-def _shape_change(old: Floats, new: Floats, prior: float) -> tuple[float, float, float]:
-    """Factors of width and height, and turn [rad], by robust least squares, with a prior of none."""
+def _slope(old: Floats, new: Floats, axis: int, prior: float) -> tuple[float, float]:
+    """Robust derivatives of one new coordinate by the same and by the other old one, with a prior of 1 and 0."""
     spread = old.var(axis=0)
-    step: Floats = np.zeros(3)
+    step: Floats = np.zeros(2)
     weight: Floats = np.ones(len(old))
-    change = new - old
     for _ in range(3):
+        change = new - old[:, axis]
+        residual = change - old @ step
+        residual = residual - weight @ residual / weight.sum()
+        scale = max(middle(np.abs(residual)), 0.1)
+        weight = np.asarray(1.0 / (1.0 + np.square(residual / (2.0 * scale))), np.float64)
         centred = old - weight @ old / weight.sum()
-        moved = change - weight @ change / weight.sum()
-        x, y = centred.T
-        wx, wy = weight * x, weight * y
-        normal = np.array([[wx @ x, 0.0, -(wx @ y)], [0.0, wy @ y, wx @ y], [-(wx @ y), wx @ y, wx @ x + wy @ y]])
-        normal[[0, 1, 2], [0, 1, 2]] += prior * np.append(spread, spread.sum()) + 1e-6
-        step = np.linalg.solve(normal, [wx @ moved[:, 0], wy @ moved[:, 1], wx @ moved[:, 1] - wy @ moved[:, 0]])
-        residual = moved - np.column_stack([step[0] * x - step[2] * y, step[1] * y + step[2] * x])
-        squared = np.square(residual).sum(axis=1)
-        scale = max(middle(np.sqrt(squared)), 0.1)
-        weight = 1.0 / (1.0 + squared / (2.0 * scale) ** 2)
-    wider, higher = (float(v) for v in np.clip(1.0 + step[:2], 1.0 / _MAX_STEP, _MAX_STEP))
-    return wider, higher, float(np.clip(step[2], -_MAX_TURN, _MAX_TURN))
+        normal = centred.T @ (weight[:, None] * centred) + np.diag(prior * spread + 1e-6)
+        step = np.asarray(np.linalg.solve(normal, centred.T @ (weight * change)), np.float64)
+    slope = float(np.clip(1.0 + step[axis], 1.0 / _MAX_STEP, _MAX_STEP))
+    return slope, float(np.clip(step[1 - axis], -_MAX_TURN, _MAX_TURN))
 
 
 class ScaleFilter:

@@ -229,7 +229,7 @@ def test_a_target_that_turned_while_it_was_away_is_found_soon(scene: Image, angl
     paint(still, *place)
     cv2.rectangle(mask, (293, 309), (326, 330), (1, 1, 1), -1)
     turned = np.where(cv2.warpAffine(mask, rotation, size) > 0, cv2.warpAffine(still, rotation, size), scene)
-    share = np.clip((np.arange(60) - 20) / 6, 0, 1) - np.clip((np.arange(60) - 36) / 6, 0, 1)
+    share = np.clip((np.arange(68) - 20) / 6, 0, 1) - np.clip((np.arange(68) - 36) / 6, 0, 1)
     images = []
     for k, x in enumerate((150 + 420 * share).astype(int)):
         window = (turned if k > 30 else still)[200 : 200 + SIZE[1], x : x + SIZE[0]]

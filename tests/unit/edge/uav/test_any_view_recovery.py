@@ -409,7 +409,7 @@ def test_while_the_target_is_beyond_the_border_a_place_needs_higher_odds() -> No
     """Each search of an image that does not show it is another chance for what only looks like it."""
     image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     found = []
-    for x, odds in ((160.0, 2.5), (-60.0, 4.5)):
+    for x, odds in ((160.0, 3.0), (-60.0, 4.5)):
         search, expected = redetection(), prediction(x)
         candidate = Candidate(OrientedBox(160.0, 120.0, 30.0, 20.0), 0.0, expected.motion, 5, odds, odds)
         search._tested = [candidate]
