@@ -112,17 +112,17 @@ def test_a_pause_after_frames_that_came_all_at_once_is_no_step() -> None:
     assert events == []
 
 
-@pytest.mark.parametrize("is_told", [True, False])
+@pytest.mark.parametrize("knows", [True, False])
 @pytest.mark.parametrize(("step_s", "steps"), [(0.45, 0), (30.0, 0), (-0.45, 1), (1.7e9, 1)])
-def test_of_frames_that_waited_for_the_hub_a_pause_is_no_step(step_s: float, steps: int, is_told: bool) -> None:
+def test_of_frames_that_waited_for_the_hub_a_pause_is_no_step(step_s: float, steps: int, knows: bool) -> None:
     """A hub was restarted just after a camera had stalled without counting its frames: its pose was not used again."""
     detector, events = ClockChangeDetector(), list[ClockChange]()
     for number in range(200):
         shown = round(1e9 * (number / 30.0 + step_s * (number >= 100)))
         waited = number < 150
         # Over a slow link it takes longer than the hub waits for a backlog.
-        arrival = 50.0 + max(number, 150) / 30.0 if not waited or not is_told else None
-        _, event = detector.handle("cam0", "b", number, number, shown, arrival, waited=waited and is_told)
+        arrival = 50.0 + max(number, 150) / 30.0 if not waited or not knows else None
+        _, event = detector.handle("cam0", "b", number, number, shown, arrival, waited=waited and knows)
         events += [] if event is None else [event]
     assert [event.kind for event in events] == ["step"] * steps
 
