@@ -35,7 +35,7 @@ _QUERIES_AT_ONCE, _QUERIES_OF_KEY = 8, 2
 or 8 at once, 2.7 s with 16; with 64 and more the link stalled for seconds, and queries ended without a reply."""
 _LEAST_PART, _LONGEST_WAIT_S = 16, 0.5
 """Messages that one query asks for, at least, and for how long it may wait on the link, and what comes by itself behind
-it: over 100 kB/s six cameras with 1.2 MB each kept a seventh silent for 16 s where 256 were asked for, now for 2 to 7."""
+it: over 100 kB/s six cameras with 1.2 MB each kept a seventh silent for 16 s with 256 messages, now for 2 to 7 s."""
 _GAP_QUERY_S = 10.0  # a third of GAP_TIMEOUT_S: three queries before it is lost
 _CHANNEL, _AT_ONCE = 512, 256
 """Samples between Zenoh and a subscription's thread, 3 ms of a flood: while it is full, Zenoh waits. And of these taken
