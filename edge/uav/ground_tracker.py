@@ -408,7 +408,7 @@ class GroundTracker:
                 if not reacquiring and best.angle != target.angle:
                     target.update_crab_angle(best, self._heading)
             if sure and not measurement.ambiguous:
-                target.update_local_gain(image, best)
+                target.update_local_gain(best)
                 if self._frame % 4 == 0 and complete and best.score > 0.75:
                     target.update_appearance(image, best)
 

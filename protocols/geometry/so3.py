@@ -65,20 +65,17 @@ def quaternion(rotation: Floats) -> Floats:
 
     Shepperd's method: of the four rows, each a multiple of the quaternion, the one with the largest component.
     """
-    m = np.asarray(rotation, dtype=np.float64)
-    x, y, z = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
-    rows = np.array(
-        [
-            [1.0 + m[0, 0] + m[1, 1] + m[2, 2], x, y, z],
-            [x, 1.0 + m[0, 0] - m[1, 1] - m[2, 2], xy, xz],
-            [y, xy, 1.0 - m[0, 0] + m[1, 1] - m[2, 2], yz],
-            [z, xz, yz, 1.0 - m[0, 0] - m[1, 1] + m[2, 2]],
-        ]
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.asarray(rotation, dtype=np.float64).tolist()
+    x, y, z = zy - yz, xz - zx, yx - xy
+    xy, xz, yz = xy + yx, xz + zx, yz + zy
+    rows = (
+        (1.0 + xx + yy + zz, x, y, z),
+        (x, 1.0 + xx - yy - zz, xy, xz),
+        (y, xy, 1.0 - xx + yy - zz, yz),
+        (z, xz, yz, 1.0 - xx - yy + zz),
     )
-    q = rows[int(np.argmax(np.diag(rows)))]
-    q = q / np.linalg.norm(q)
-    return np.asarray(-q if q[0] < 0 else q)
+    q = max(enumerate(rows), key=lambda row: row[1][row[0]])[1]
+    return np.array(q) / math.copysign(math.hypot(*q), q[0])
 
 
 def from_quaternion(q: Floats) -> Floats:
@@ -91,10 +88,9 @@ def from_quaternion(q: Floats) -> Floats:
 def log(rotation: Floats) -> Floats:
     """Rotation vector (3,) [rad], |w| <= pi, of one rotation matrix (3, 3)."""
     q = quaternion(rotation)
-    sine = float(np.linalg.norm(q[1:]))
-    if sine < 1e-12:
-        return np.asarray(2.0 * q[1:])
-    return np.asarray(2.0 * np.arctan2(sine, q[0]) / sine * q[1:])
+    w, x, y, z = q.tolist()
+    sine = math.hypot(x, y, z)
+    return np.asarray((2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine) * q[1:])
 
 
 def nearest(matrix: Floats) -> Floats:

@@ -7,6 +7,7 @@ place of the image shift and rotation of the background-aware tracking paper (eq
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TypeAlias, TypeVar
 
@@ -17,7 +18,7 @@ import numpy.typing as npt
 from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
 from edge.uav.ground.plane_pose import PlaneCamera, PlaneHomography, PlanePose
 from protocols.geometry import kernels, so3
-from protocols.geometry.order_statistics import median
+from protocols.geometry.order_statistics import median, quantile
 from protocols.geometry.types import Bools, Floats
 
 Gray = npt.NDArray[np.uint8]
@@ -26,7 +27,10 @@ _WORKING_WIDTH = 430  # approximate width of the image on which Lucas-Kanade run
 _MAX_TRACKS = 110  # for six unknowns: more cost CPU, fewer leave too few where buildings hide the ground
 LK_WINDOW = 13  # px of the working image: smaller ones fail on little texture, larger ones mix roofs and ground
 _MAX_ITERATIONS = 6  # Gauss-Newton steps, a bound: three narrow the kernel, and it stops where it has converged
+_MAX_LEVELS = 2  # halvings of the image for Lucas-Kanade
+_PYRAMID_MARGIN = 4.0  # how much farther from where they are expected corners may be than in the frame before
 _CORNER_STD = 0.35  # of a tracked corner [px of the working image]
+_MIN_NEW_TRACKS = 16  # a search takes as long as following all tracks three times
 _MAX_RESIDUAL = 1.5  # of a corner on the plane [px of the working image]
 _MAX_BAD_FRAMES = 3  # after which a track is dropped
 
@@ -59,6 +63,7 @@ class EgoMotion:
         self.pose: PlanePose | PlaneHomography = PlaneHomography(np.eye(3))
         self._previous: PlanePose | PlaneHomography | None = None
         self._last_dt = 1.0 / 30.0
+        self._levels = _MAX_LEVELS
         self._gray: Gray | None = None
         self._pixels: npt.NDArray[np.float32] = np.zeros((0, 2), np.float32)
         self._ground: Floats = np.zeros((0, 2))
@@ -121,12 +126,14 @@ class EgoMotion:
         guess = self._predicted(dt) if predicted is None else predicted
         std = guess.prediction_std(dt, self._distance()) * std_factor
         start = self._project(guess)
-        flow = self._lucas_kanade(gray, start, 2)
+        flow = self._lucas_kanade(gray, start, self._levels)
         found, good, report = self._track_and_solve(guess, std, (attitude, position), flow)
         if report.inlier_share < 0.6 or report.tracks < 8:
             shift = self._coarse_shift(gray, guess)
             wide = std * 8.0
-            second = self._track_and_solve(guess, wide, (None, None), self._lucas_kanade(gray, start + shift, 3))
+            second = self._track_and_solve(
+                guess, wide, (None, None), self._lucas_kanade(gray, start + shift, _MAX_LEVELS + 1)
+            )
             if second[2].inlier_share * min(second[2].tracks, 30) > report.inlier_share * min(report.tracks, 30):
                 found, good, report = second
         previous = self.pose
@@ -135,8 +142,13 @@ class EgoMotion:
             self.pose = found
             self.frames_without_pose = 0
             self.correspondences = self._pixels[good[2]].astype(np.float64), good[0][good[2]].astype(np.float64)
+            off = np.hypot(*(good[0][good[2]] - start[good[2]]).T)
+            # Lucas-Kanade reaches half a window, and twice that with each halving.
+            reach = max(_PYRAMID_MARGIN * quantile(off, 0.9) / (0.5 * LK_WINDOW), 1.0)
+            self._levels = min(math.ceil(math.log2(reach)), _MAX_LEVELS)
             self._update_tracks(good)
         else:
+            self._levels = _MAX_LEVELS
             self.pose = guess
             self.frames_without_pose += 1
             self.correspondences = np.zeros((0, 2)), np.zeros((0, 2))
@@ -248,7 +260,7 @@ class EgoMotion:
         assert self._gray is not None
         self._frames_since_detection = 0
         wanted = _MAX_TRACKS - len(self._pixels)
-        if wanted < 8:
+        if wanted < _MIN_NEW_TRACKS:
             return
         height, width = self._gray.shape[:2]
         spacing = max(5, width // 26)

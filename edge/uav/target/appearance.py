@@ -25,6 +25,7 @@ _MIN_TARGET_CELLS = 12.0  # the same, at least: cells of 0.4 m still tell a car'
 _MIN_SHAPE_RATIO = 0.75  # to the typical shape response: the same car under other illumination
 _BRIGHTNESS = np.array([0.114, 0.587, 0.299])  # of blue, green and red, as in OpenCV's grey
 _MIN_BRIGHTNESS_CONTRAST = 4.0  # squared, in variances of the background: two stds stand out from a patterned ground
+_LOG_LEVELS = np.log(np.maximum(np.arange(256.0), 8.0))  # darker is noise
 _MIN_VISIBLE_SHARE = 0.3  # of the footprint inside the image
 
 
@@ -33,7 +34,7 @@ class Candidate:
     """A candidate detection. ground: (2,); score: 1 = as the target typically matches, 0 = as background.
 
     colour, shape: its responses; visible_share: share of the footprint inside the image; angle: of the patch in which
-    it was found [rad].
+    it was found [rad]; patch: that patch.
     """
 
     ground: Floats
@@ -42,6 +43,7 @@ class Candidate:
     shape: float
     visible_share: float
     angle: float = 0.0
+    patch: GroundPatch | None = None
 
 
 class AppearanceModel:
@@ -179,7 +181,7 @@ class AppearanceModel:
         ky, kx = self._target_mask.shape
         at = patch.to_cells(centre[None])[0]
         cells = cv2.getRectSubPix(patch.cells, (kx, ky), (float(at[0]), float(at[1])))
-        levels = np.log(np.maximum(cells.astype(np.float64), 8.0)).mean(axis=2)
+        levels = _LOG_LEVELS[cells].mean(axis=2)
         return float((levels * self._target_mask).sum() / float(self._target_mask.sum()))
 
     def shape_matches(self, candidate: Candidate) -> bool:
@@ -232,7 +234,7 @@ class AppearanceModel:
             at_score, at_colour, at_shape, share = (
                 float(field[row, column]) for field in (score, colour, shape, visible)
             )
-            found.append(Candidate(ground, at_score, at_colour, at_shape, share, patch.angle))
+            found.append(Candidate(ground, at_score, at_colour, at_shape, share, patch.angle, patch))
             if len(found) == limit:
                 break
         return found

@@ -149,13 +149,10 @@ class Target:
             self.position = best.ground
             self._learn(image, 1.0)
 
-    def update_local_gain(self, image: Image, best: Candidate) -> None:
+    def update_local_gain(self, best: Candidate) -> None:
         """Update the photometric gain at the target if it is complete and its shape matches."""
-        if best.visible_share < _FULL_SHARE or not self.appearance.shape_matches(best):
-            return
-        patch = self.patch(image, best.ground, 0.7)
-        if patch is not None:
-            self.local_gain.update(self.appearance.log_brightness(patch, best.ground))
+        if best.patch is not None and best.visible_share >= _FULL_SHARE and self.appearance.shape_matches(best):
+            self.local_gain.update(self.appearance.log_brightness(best.patch, best.ground))
 
     def update_appearance(self, image: Image, best: Candidate) -> None:
         """Adapt the appearance slightly to a certain, complete detection."""
