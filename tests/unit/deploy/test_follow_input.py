@@ -226,6 +226,8 @@ def test_a_head_below_its_foot_is_named_with_its_line(tmp_path: Path) -> None:
     text = "camera,frame,time,u,v,label\nleft,0,0,50,90,ann-head\nleft,0,0,52,20,ann-foot\n"
     with pytest.raises(InputError, match=r"rows.csv:3: ann: the head is not above the foot"):
         read_objects(rows(tmp_path, text), SIZES)
+    ceiling = text + "left,1,1,50,20,ann-head\nleft,1,1,52,90,ann-foot\n"
+    assert len(read_objects(rows(tmp_path, ceiling), SIZES)) == 4
 
 
 @pytest.mark.parametrize("scale", [0.001, 100.0, 1000.0, 3.281, 39.37])
