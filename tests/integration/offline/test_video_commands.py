@@ -19,11 +19,12 @@ import pytest
 import tomli_w
 
 from deploy.cli import run
+from deploy.offline.video_folder import list_videos
 from edge.devices.playback.video_reader import VideoReader
 from edge.offline.detections import HEADER
 from edge.scenes.marker.scene import MarkerScene
 from protocols.core.acceptance import PairReport
-from protocols.core.errors import Refused
+from protocols.core.errors import InputError, Refused
 from protocols.geometry.types import Floats
 from tests.support.sounds import add_sound, heard, sound_events
 from tests.support.videos import Image, numbered_image, read_number, record_scene_videos, write_video
@@ -86,6 +87,17 @@ def test_warnings_name_the_videos_that_cannot_be_used(recorded: RecordedVideos) 
     assert "broken.mp4: no frame can be read" in warnings
     assert "wall.mp4: no ball" in warnings
     assert toml(recorded.out / "calibration.toml")["metadata"]["refused"]["wall"] == "no observations"
+
+
+@pytest.mark.parametrize("names", [("GH010042", "GH020042"), ("GOPR0042", "GP010042")])
+def test_chapters_of_one_recording_are_no_cameras(names: tuple[str, str], tmp_path: Path) -> None:
+    """Each was taken for a camera, and of the longest recordings most was left out for want of a common time."""
+    for name in ("GH010041", "GX010042", *names):
+        (tmp_path / f"{name}.MP4").write_bytes(name.encode())
+    with pytest.raises(InputError, match=f"{names[0]}.MP4 and {names[1]}.MP4 are chapters of one recording; join"):
+        list_videos(tmp_path)
+    (tmp_path / f"{names[1]}.MP4").unlink()
+    assert len(list_videos(tmp_path)[0]) == len(list(tmp_path.iterdir()))
 
 
 def test_detections_of_unchanged_videos_are_reused(recorded: RecordedVideos, tmp_path: Path, capsys: Capture) -> None:
