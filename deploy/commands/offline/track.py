@@ -173,6 +173,7 @@ def track(
         warnings.append(f"{telemetry}: its positions were used in no frame: {why}")
     if isinstance(recording, LoggedFlightImages) and recording.damage:
         warnings.append(f"{video}: damaged: {recording.damage}; only its intact part was tracked")
+    warnings += tracking.corners_for_a_box(box, size)
     if recording.repaired:
         warnings.append(f"{video}: {recording.repaired} frames have no usable time stamp")
     scores = score(rows, truth, size) if truth is not None else None

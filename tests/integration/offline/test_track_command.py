@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
+from deploy.offline.track import corners_for_a_box, parse_target
 from deploy.simulation.flight import write_simulated_flight
 from edge.mavlink.dialect import mavlink
 from protocols.core.jpeg import encode_jpeg
@@ -228,6 +229,14 @@ def test_bad_input_gives_one_line_and_exit_status_2(
     assert message in output
     assert "\n" not in output
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("box", ["301,200,22,47", "10,10,44,20", "5,8,200,120"])
+def test_a_box_that_may_be_two_corners_is_warned_of(box: str) -> None:
+    """A quarter of the picture was followed in place of the car, without a word."""
+    [warning] = corners_for_a_box(parse_target("301,200,323,247"), (640, 480))
+    assert warning.endswith("give --target 301,200,22,47")
+    assert not corners_for_a_box(parse_target(box), (640, 480))
 
 
 def test_files_that_are_no_video_are_rejected(
