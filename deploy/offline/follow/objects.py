@@ -191,12 +191,13 @@ def _check_pairs(rows: DetectionRows, file: Path) -> None:
         name, _, end = label.rpartition("-")
         if name and end in ("head", "foot"):
             ends.setdefault((rows.camera[row], float(rows.time[row]), name), {}).setdefault(end, row)
-    pairs = [(key[2], one["head"], one["foot"]) for key, one in ends.items() if len(one) == 2]
-    head, foot = (rows.pixels[[pair[k] for pair in pairs]].reshape(-1, 2) for k in (1, 2))
+    names = [name for (_, _, name), one in ends.items() if len(one) == 2]
+    pairs = np.array([[one["head"], one["foot"]] for one in ends.values() if len(one) == 2], dtype=np.int64)
+    head, foot = rows.pixels[pairs.reshape(-1, 2).T]
     for index in np.flatnonzero(swapped_ends(head, foot))[:1].tolist():
-        name, *both = pairs[index]
-        what = f"{name}: the head is not above the foot"
-        raise InputError(what, file=file, line=max(rows.line[row] for row in both), remedy="swap the labels")
+        what = f"{names[index]}: the head is not above the foot"
+        line = max(rows.line[row] for row in pairs[index].tolist())
+        raise InputError(what, file=file, line=line, remedy="swap the labels")
 
 
 def object_messages(rows: DetectionRows) -> list[pb.Observation]:

@@ -203,7 +203,6 @@ def test_times_that_do_not_increase_are_repaired_by_the_nominal_rate(
     looped.open()
     for _ in range(13):
         assert looped.read(0.0) is not None
-    assert looped.warnings == ("3 frames have no usable time stamp",)  # of the second round
 
 
 def test_a_given_rate_overrides_the_files(tmp_path: Path) -> None:
