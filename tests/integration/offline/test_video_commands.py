@@ -452,6 +452,27 @@ def test_lags_that_are_not_known_are_refused_as_such_and_not_for_want_of_lenses(
     assert "intrinsics" not in message
 
 
+def test_a_video_whose_lag_is_not_known_is_left_out_for_that_and_not_for_want_of_a_lens(
+    without_lenses: tuple[Path, Path, str], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a phone that was held by hand it said to run `syncline intrinsics`."""
+    folder, out, _ = without_lenses
+    shutil.copytree(out / "session", tmp_path / "sync" / "timing" / "session")
+    videos = tmp_path / "videos"
+    shutil.copytree(folder, videos)
+    write_video(videos / "hand.mp4", [np.full((64, 96, 3), 90, np.uint8)] * 20, np.arange(20) / 10)
+
+    def refuse(*_: object, **__: object) -> None:
+        pairs = (PairReport(("cam0", "cam1"), "ok", 0.1, 1.0), PairReport(("cam1", "hand"), "too little agrees"))
+        raise Refused("fewer than two cameras", {"hand": "no intrinsics: run `syncline intrinsics`"}, pairs=pairs)
+
+    monkeypatch.setattr("hub.api.calibrate", refuse)
+    assert run(["sync", str(videos), "--videos", "none", "--out", str(tmp_path / "sync")]) == 0
+    printed = capsys.readouterr().out
+    assert "warning: hand.mp4: its lag is not known (with cam1: too little agrees); left out" in printed
+    assert "intrinsics" not in printed
+
+
 def test_videos_in_which_nothing_moves_are_synchronised_by_their_sounds(tmp_path: Path, capsys: Capture) -> None:
     folder = tmp_path / "videos"
     folder.mkdir()
