@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -197,6 +197,8 @@ def calibrate(
     from hub.calibration.triangulation import meant_convention, unlikely_speed
 
     options = options or CalibrationOptions()
+    if options.solver not in get_args(Solver):
+        raise InputError(f"there is no solver {options.solver!r}", remedy=f"use one of {', '.join(get_args(Solver))}")
     if options.from_known is not None and options.solver != "joint":
         raise InputError("--from-known goes with --solver joint", remedy="leave one of the two out")
     if options.refine_lenses and (options.from_known is not None or options.solver != "joint"):
@@ -315,6 +317,10 @@ def triangulate(
         seen, warnings = _read_rows(Path(session), None if observations is None else Path(observations), rig)
     left = [name for name in seen.cameras if name not in known]
     if left:
+        if len(left) == len(seen.cameras):
+            what = f"none of its cameras ({', '.join(left)}) is in the calibration ({', '.join(known)})"
+            file = None if isinstance(session, Session) else Path(session)
+            raise InputError(what, file=file, remedy="take the calibration of these cameras")
         warnings = (*warnings, f"not in the calibration, left out: {', '.join(left)}")
     used = Observations({key: track for key, track in seen.tracks.items() if key[0] in known})
     used, note = associate_with_calibration(rig, known, used)

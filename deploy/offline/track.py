@@ -38,6 +38,9 @@ _POSITION = ("north", "east", "down")
 # Their height may be of the sea or the ellipsoid: they give no position above the ground.
 _GEODETIC = ("lat", "lon", "alt", "latitude", "longitude", "altitude")
 _TELEMETRY_LOOKAHEAD_S = 0.6  # lead with which samples are passed to the tracker: clocks may differ by 0.5 s
+_LARGE, _MUCH_LARGER = 0.04, 9.0
+"""A box of this share of the picture, a fifth of each side, and so much larger than the box between the two corners
+that its numbers may be: from the air few targets are."""
 
 _MARGIN = 0.5  # fraction of the image size added on each side
 _MAX_CANVAS_PX = 1280  # side of the overlay's picture: fits a screen
@@ -88,6 +91,16 @@ def parse_target(text: str) -> Box:
     if values[2] <= 0 or values[3] <= 0:
         raise InputError(f"--target {text!r} has no width or height", remedy=remedy)
     return Box(*values)
+
+
+def corners_for_a_box(box: Box, size: tuple[int, int]) -> tuple[str, ...]:
+    """A warning where a box seems to be given by two corners. size: of the picture [px]."""
+    x, y, width, height = box.x, box.y, box.width, box.height
+    between, area = (width - x) * (height - y), width * height
+    if not (x < width and y < height and area > max(_LARGE * size[0] * size[1], _MUCH_LARGER * between)):
+        return ()
+    corners = f"--target {x:g},{y:g},{width - x:g},{height - y:g}"
+    return (f"the target is {width:g}x{height:g} px of {size[0]}x{size[1]}: if you gave two corners, give {corners}",)
 
 
 def choose_camera(rig_file: Path, video: Path) -> RigCamera:

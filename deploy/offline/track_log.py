@@ -27,8 +27,7 @@ _FPS = 30.0  # where the log does not tell
 class LoggedFlightImages(Playback):
     """Images of the agent and boot with the most images. lens, body_from_camera: as known to that agent.
 
-    source: that agent and boot. count: images in the log. damage: what is wrong with the log, or "". repaired: images
-    that cannot be decoded, or whose time does not increase. first_s: camera time of the first image [s].
+    source: that agent and boot. count: images in the log. first_s: camera time of the first image [s].
     Raises InputError if the log has no image that can be decoded.
     """
 
@@ -42,7 +41,6 @@ class LoggedFlightImages(Playback):
             what = "this log contains no flight images"
             raise InputError(what, file=log, remedy="give the video, or record a UAV agent with [images]")
         self.source, self.count = names.most_common(1)[0]
-        self.damage = self._reader.damage
         known: pb.UavInfo | None = None
         for logged in self._reader.messages([UAV_INFO]):
             message: Any = logged.message
@@ -51,7 +49,7 @@ class LoggedFlightImages(Playback):
                 break
         self.lens = intrinsics or (None if known is None else Intrinsics.of_message(known))
         self.body_from_camera = _mounting(known)
-        self.repaired = 0
+        self._left_out = 0
         self._frames = self._read()
         self._pending = first = next(self._frames, None)
         if first is None:
@@ -60,6 +58,15 @@ class LoggedFlightImages(Playback):
         height, width = first.image.shape[:2]
         rate = fps or (known.fps if known is not None and known.fps > 0.0 else _FPS)
         self._info = DeviceInfo(width, height, rate, "log", "stream", self.lens, unknown=("exposure",))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Problems of the log so far, one line each."""
+        damage, left_out = self._reader.damage, self._left_out
+        return (
+            *((f"damaged: {damage}; only its intact part was tracked",) if damage else ()),
+            *((f"{left_out} images cannot be decoded, or their times do not increase: left out",) if left_out else ()),
+        )
 
     def _read(self) -> Iterator[Frame]:
         newest = -1
@@ -70,7 +77,7 @@ class LoggedFlightImages(Playback):
                 continue
             image = decode_image(message)
             if image is None or message.device_time_ns <= newest or image.shape != (shape or image.shape):
-                self.repaired += 1
+                self._left_out += 1
                 continue
             newest, shape = message.device_time_ns, image.shape
             yield Frame(image, message.device_time_ns, message.frame)

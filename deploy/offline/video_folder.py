@@ -7,6 +7,7 @@ import functools
 import hashlib
 import json
 import os
+import re
 import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
@@ -49,6 +50,8 @@ _LARGEST_SQUARE_M = 1.0  # of a board that a hand can move; 30 is likely to be m
 _NOTHING = "nothing"  # what is searched where nothing was recognised
 _LEAST_ROWS = 3  # of a tag's corner in a video
 _SAME_TIME_S = 1e-3  # s: containers round time stamps to milliseconds
+_CHAPTER = re.compile(r"(G[HXP]\d\d|GOPR)(\d{4})", re.IGNORECASE)
+"""GoPro's names of a recording's files: GH010042, GH020042, …; GOPR0042, GP010042, …"""
 _LENS = ("matrix", "distortions", "fisheye", "focal_std")
 
 
@@ -95,7 +98,13 @@ def list_videos(folder: Path) -> tuple[list[VideoFile], list[str]]:
     videos: list[VideoFile] = []
     warnings: list[str] = []
     contents: dict[tuple[int, str], str] = {}
+    recordings: dict[tuple[str, str], str] = {}
     for path in paths:
+        if chapter := _CHAPTER.fullmatch(path.stem):
+            first = recordings.setdefault((chapter[1][:2].upper().replace("O", "P"), chapter[2]), path.name)
+            if first != path.name:
+                remedy = "join them, as with ffmpeg's concat demuxer, into one file a camera"
+                raise InputError(f"{first} and {path.name} are chapters of one recording", file=folder, remedy=remedy)
         camera = name_from_file(path.stem, path)
         same = next((video.path.name for video in videos if video.camera == camera), None)
         if same is not None:

@@ -163,7 +163,7 @@ def _time_maps(
     starts = {
         name: known[name].time_map.reference_from_camera(CameraTime(prepared.time_origins[name])) for name in names
     }
-    common_start = min(starts.values())
+    common_start = min(starts.values(), default=0.0)
     clocks = {}
     for name in names:
         times = np.concatenate([part.time for part in prepared.rows[name]])

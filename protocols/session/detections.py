@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from protocols.geometry.types import Floats, Ints
+from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.observations import ObservationRows, read_rows
 
 COLUMNS = (
@@ -23,6 +23,8 @@ COLUMNS = (
 KINDS = ("", "marker", "person", "vehicle", "corner")
 _MAX_VARIANCE = 1e12
 """[px²]: of a standard deviation of the largest pixel that is accepted."""
+_SWAPPED = 0.9
+"""Share of the heads below their feet in a table where the two are swapped; below a ceiling camera it is half."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +59,7 @@ def read_detections(file: Path, sizes: Mapping[str, tuple[int, int]]) -> Detecti
 
     sizes: (width, height) [px] of the images of each camera that the rig knows. Raises InputError (file, line, what,
     remedy) where a value is no number, out of range, or contradicts another one: a half-given point, box or covariance,
-    a covariance that is not positive semi-definite, a box without area or outside the image, a head below its foot.
+    a covariance that is not positive semi-definite, a box without area or outside the image, swapped heads and feet.
     """
     rows = read_rows(file, sizes, COLUMNS)
     score = rows.numbers("score", 1.0)
@@ -68,10 +70,8 @@ def read_detections(file: Path, sizes: Mapping[str, tuple[int, int]]) -> Detecti
     invalid = (uu < 0.0) | (vv < 0.0) | (uv * uv > uu * vv * (1.0 + 1e-9) + 1e-12)
     rows.table.refuse(invalid, lambda row: "cov_uu, cov_uv, cov_vv are no covariance")
     head, foot = _together(rows, ("head_u", "head_v")), _together(rows, ("foot_u", "foot_v"))
-    across, down = (foot - head).T
-    # In a camera on its side, head and foot are beside each other.
-    turned = (down <= 0.0) & (np.abs(across) <= np.abs(down))
-    rows.table.refuse(turned, lambda row: "the head is not above the foot", "swap them, or turn the images upright")
+    remedy = "swap them, or turn the images upright"
+    rows.table.refuse(swapped_ends(head, foot), lambda row: "the head is not above the foot", remedy)
     box = _together(rows, ("box_x", "box_y", "box_w", "box_h"))
     rows.table.refuse((box[:, 2:] <= 0.0).any(axis=1), lambda row: f"a box of {box[row, 2]:g} x {box[row, 3]:g} px")
     limit = np.array([sizes[name] for name in rows.camera], dtype=np.float64).reshape(-1, 2)
@@ -92,6 +92,18 @@ def read_detections(file: Path, sizes: Mapping[str, tuple[int, int]]) -> Detecti
         box,
         rows.table.line,
     )
+
+
+def swapped_ends(head: Floats, foot: Floats) -> Bools:
+    """Which heads (n, 2) [px] are below their feet, where nearly all of them are; otherwise none.
+
+    From the ceiling, heads point away from below the camera, to all sides. In a camera on its side they are beside the
+    feet.
+    """
+    across, down = (foot - head).T
+    along = np.abs(across) <= np.abs(down)
+    below = along & (down <= 0.0)
+    return np.asarray(below & (below.sum() > _SWAPPED * along.sum()))
 
 
 def _together(rows: ObservationRows, names: tuple[str, ...], limit: float = 1e6) -> Floats:

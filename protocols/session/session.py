@@ -14,7 +14,7 @@ from protocols.core.errors import InputError
 from protocols.core.tables import dataframe
 from protocols.session.folder import column_warnings
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
-from protocols.session.rig import Rig, parse_rig
+from protocols.session.rig import Rig, misspelt_keys, parse_rig
 
 if TYPE_CHECKING:
     import pandas
@@ -47,7 +47,10 @@ class Session:
         Raises InputError where a column is missing, not finite, or names a camera that the rig does not have.
         """
         if not isinstance(rig, Rig):
-            tables = {key: {name: _plain(value) for name, value in table.items()} for key, table in rig.items()}
+            if not isinstance(rig, Mapping) or not all(isinstance(one, Mapping) for one in rig.values()):
+                remedy = 'give {"cam0": {"size": [1920, 1080], "matrix": …, "distortions": …}, …}'
+                raise InputError("the rig is not a dict with a dict for each camera", remedy=remedy)
+            tables = {str(key): {str(k): _plain(value) for k, value in table.items()} for key, table in rig.items()}
             rig = parse_rig(tables, Path("rig"), tomli_w.dumps(tables))
         missing = [column for column in _COLUMNS if column not in table]
         if missing:
@@ -74,7 +77,7 @@ class Session:
         found = gather_tracks(
             cameras, labels, frame, given["time"], np.column_stack([given["u"], given["v"]]), size, order=rig.cameras
         )
-        found = replace(found, warnings=found.warnings + column_warnings(rig, found))
+        found = replace(found, warnings=found.warnings + column_warnings(rig, found) + misspelt_keys(rig))
         return cls(rig, found, found.warnings, name)
 
     def to_dataframe(self) -> pandas.DataFrame:

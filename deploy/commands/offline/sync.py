@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from deploy.commands.common import Json, UnusedSeed, answer, check_range, closing_lines
 from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError
+
+if TYPE_CHECKING:
+    from protocols.core.acceptance import PairReport
 
 
 def sync(
@@ -71,12 +75,14 @@ def sync(
             found[file.camera] = VideoReader(file.path)
         except InputError as error:
             warnings.append(f"{file.path.name}: {error.what}; left out")
+    reasons: dict[str, str] = {}
     if calibration is None:
-        calibration = _estimate(folder, out / "timing", json)
+        calibration, reasons = _estimate(folder, out / "timing", json)
     reference, known, stds, refused = syncing.read_time_maps(calibration, found)
+    refused = {**refused, **reasons}
     unknown = [film.path.name for name, film in found.items() if name not in known]
-    reasons = [refused.get(name, f"{name} is not in the calibration") for name in found if name not in known]
-    warnings += [f"{file}: {why}; left out" for file, why in zip(unknown, reasons, strict=True)]
+    why_not = [refused.get(name, f"{name} is not in the calibration") for name in found if name not in known]
+    warnings += [f"{file}: {why}; left out" for file, why in zip(unknown, why_not, strict=True)]
     used = [video for video in listed if video.camera in known and video.camera in found]
     if not used:
         names = ", ".join(known)
@@ -139,8 +145,11 @@ def sync(
     return answer(document, [*lines, *closing_lines(warnings, written)], json)
 
 
-def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
-    """Calibrate the videos as far as they allow; the file with their clocks. Raises Refused where there are none."""
+def _estimate(folder: Path, out: Path, quiet: bool) -> tuple[Path, dict[str, str]]:
+    """Calibrate the videos as far as they allow; the file with their clocks, and why others have none, by camera.
+
+    Raises Refused where none is known.
+    """
     from deploy.offline.video_folder import SESSION, session_from_videos
     from hub.api import CALIBRATION, RESULT, calibrate, save_refusal
     from hub.clocks.sound import sound_pairs
@@ -154,7 +163,8 @@ def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
         if session.refusal is not None:
             raise session.refusal
         with progress_bar("estimating the lags", quiet=quiet) as progress:
-            calibrate(session, progress=progress).save(out)
+            result = calibrate(session, progress=progress)
+        result.save(out)
     except Refused as refusal:
         refusal.pairs += sound_pairs(session.clock_priors, refusal.pairs)
         save_refusal(out, refusal, session)
@@ -163,5 +173,16 @@ def _estimate(folder: Path, out: Path, quiet: bool) -> Path:
                 every = "; ".join(f"{' and '.join(pair.cameras)}: {pair.status}" for pair in refusal.pairs)
                 refusal.reason = f"the lag of no pair of these videos is known ({every})"
             raise
-        return out / RESULT
-    return out / CALIBRATION
+        return out / RESULT, _unknown_lags(refusal.pairs)
+    return out / CALIBRATION, _unknown_lags(result.calibration.pairs)
+
+
+def _unknown_lags(pairs: Iterable[PairReport]) -> dict[str, str]:
+    """Why a camera is in no pair with a lag, by camera; lenses and poses, which a lag does not need, are left aside."""
+    pairs = list(pairs)
+    timed = {name for pair in pairs if pair.lag_s is not None for name in pair.cameras}
+    tried: dict[str, list[str]] = {}
+    for pair in pairs:
+        for name, other in (pair.cameras, pair.cameras[::-1]):
+            tried.setdefault(name, []).append(f"with {other}: {pair.status}")
+    return {name: f"its lag is not known ({'; '.join(all_)})" for name, all_ in tried.items() if name not in timed}

@@ -25,8 +25,6 @@ from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError
 from protocols.core.files import check_folder, remove_files, write_together
 
-_SHORT_S = 0.5  # s: the last frame of a variable rate may last for longer than others
-
 if TYPE_CHECKING:
     from edge.uav.base import Telemetry
     from edge.uav.georeference import Georeference
@@ -155,10 +153,6 @@ def track(
                 out / tracking.HYPOTHESES: tracking.hypotheses_text(rows),
             }
         )
-    # Of containers that do not count their frames, the number is the duration by the highest rate.
-    ends = count / recording.info.fps - rows[-1].time if rate is None and counted is None else math.inf
-    if count and rows[-1].frame + 1 < count and ends > _SHORT_S:
-        warnings.append(f"{video}: {rows[-1].frame + 1} of {count} frames could be decoded")
     if (
         model == "ground"
         and any(sample.position is not None for sample in samples)
@@ -171,10 +165,8 @@ def track(
             needs = "metres, down the negative height above the ground, at which the target is 0.3 to 30 m long"
             why = f"they must be north, east, down in {needs}"
         warnings.append(f"{telemetry}: its positions were used in no frame: {why}")
-    if isinstance(recording, LoggedFlightImages) and recording.damage:
-        warnings.append(f"{video}: damaged: {recording.damage}; only its intact part was tracked")
-    if recording.repaired:
-        warnings.append(f"{video}: {recording.repaired} frames have no usable time stamp")
+    warnings += tracking.corners_for_a_box(box, size)
+    warnings += [f"{video}: {text}" for text in recording.warnings]
     scores = score(rows, truth, size) if truth is not None else None
     return _summarise(out, rows, model, seed, overlay, warnings, scores, json)
 

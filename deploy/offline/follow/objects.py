@@ -24,7 +24,7 @@ from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.csv_table import CsvTable, read_csv_header, read_csv_table
-from protocols.session.detections import KINDS, DetectionRows, read_detections
+from protocols.session.detections import KINDS, DetectionRows, read_detections, swapped_ends
 from protocols.validation.rules import SCHEMA_VERSION
 
 Kind = Literal["person", "vehicle"]
@@ -69,7 +69,7 @@ def read_objects(file: Path, sizes: Mapping[str, tuple[int, int]]) -> DetectionR
     """Read boxes (camera,frame,time,x,y,width,height; x, y the top left) or the rows of an observations.csv.
 
     sizes: (width, height) of the image [px] of all cameras that the calibration knows. Raises InputError (file, line,
-    what, remedy), also for boxes outside the image, heads below feet, and cameras that are not in ``sizes``.
+    what, remedy), also for boxes outside the image, swapped heads and feet, and cameras that are not in ``sizes``.
     """
     boxes = is_boxes_file(file)
     table = read_csv_table(file, "observations", _BOX_COLUMNS if boxes else ("camera", "time"), ("kind",))
@@ -185,20 +185,19 @@ def _refuse_rounded_times(table: CsvTable) -> None:
 
 
 def _check_pairs(rows: DetectionRows, file: Path) -> None:
-    """Refuse a row NAME-head below the row NAME-foot of the same frame: InputError with the later line."""
-    ends: dict[tuple[str, float, str], int] = {}
+    """Refuse rows NAME-head and NAME-foot that are swapped: InputError with the later line of the first pair."""
+    ends: dict[tuple[str, float, str], dict[str, int]] = {}
     for row, label in enumerate(rows.label):
         name, _, end = label.rpartition("-")
-        if not name or end not in ("head", "foot"):
-            continue
-        other = ends.setdefault((rows.camera[row], float(rows.time[row]), name), row)
-        if other == row:
-            continue
-        head, foot = (row, other) if end == "head" else (other, row)
-        across, down = rows.pixels[foot] - rows.pixels[head]
-        if down <= 0.0 and abs(across) <= abs(down):
-            what = f"{name}: the head is not above the foot"
-            raise InputError(what, file=file, line=max(rows.line[head], rows.line[foot]), remedy="swap the labels")
+        if name and end in ("head", "foot"):
+            ends.setdefault((rows.camera[row], float(rows.time[row]), name), {}).setdefault(end, row)
+    names = [name for (_, _, name), one in ends.items() if len(one) == 2]
+    pairs = np.array([[one["head"], one["foot"]] for one in ends.values() if len(one) == 2], dtype=np.int64)
+    head, foot = rows.pixels[pairs.reshape(-1, 2).T]
+    for index in np.flatnonzero(swapped_ends(head, foot))[:1].tolist():
+        what = f"{names[index]}: the head is not above the foot"
+        line = max(rows.line[row] for row in pairs[index].tolist())
+        raise InputError(what, file=file, line=line, remedy="swap the labels")
 
 
 def object_messages(rows: DetectionRows) -> list[pb.Observation]:

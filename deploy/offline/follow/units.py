@@ -112,6 +112,20 @@ def check_units(
     raise _refusal(_MISTAKES[best], bodies[best].up, known, session)
 
 
+def boxes_from_above(messages: Sequence[pb.Observation], known: GivenCalibration) -> str:
+    """What may be wrong with boxes of cameras that look down steeply, as a clause; empty without such boxes."""
+    steep = {
+        name
+        for name, camera in known.calibration.cameras.items()
+        if known.up is not None and -(camera.pose.rotation @ known.up)[2] > _UPRIGHT
+    }
+    boxes = any(d.box for message in messages if message.camera in steep for d in message.detections)
+    what = (
+        f"boxes of cameras that look down steeply ({', '.join(sorted(steep))}) show neither heads nor feet: give these"
+    )
+    return f"; {what}" if boxes else ""
+
+
 def _refuse_wide(messages: Sequence[pb.Observation], known: GivenCalibration, session: Path) -> None:
     """Refuse boxes that are wider than high, in cameras in whose pictures upright people stand upright."""
     standing = {

@@ -91,7 +91,8 @@ def _check_videos(videos: Sequence[VideoFile], known: GivenCalibration) -> None:
         size, lens = VideoReader(video.path).info.size, known.sizes.get(video.camera)
         if lens is not None and size != lens:
             what = f"this video is {size[0]}x{size[1]}, the calibration of {video.camera} is for {lens[0]}x{lens[1]}"
-            raise InputError(what, file=video.path, remedy="calibrate at this picture size")
+            turned = "turn it: a copy may have lost its rotation" if size == lens[::-1] else ""
+            raise InputError(what, file=video.path, remedy=turned or "calibrate at this picture size")
 
 
 def _run(jobs: list[_Job], progress: Progress) -> list[_Detected]:

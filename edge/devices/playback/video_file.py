@@ -58,12 +58,11 @@ class VideoPlayback(Playback):
         super().__init__(playback_clock)
         self._path, self._fps, self._loop, self._intrinsics = path, fps, loop, intrinsics
         self._reader: VideoReader | None = None
-        self._repaired = 0  # in the rounds of a loop before this one
 
     @property
-    def repaired(self) -> int:
-        """Frames so far whose time stamp could not be used."""
-        return self._repaired + (0 if self._reader is None else self._reader.repaired)
+    def warnings(self) -> tuple[str, ...]:
+        """Problems of the recording so far, one line each; of a loop, those of this round."""
+        return () if self._reader is None else self._reader.warnings
 
     def open(self) -> None:
         """Raises InputError if no frame can be read."""
@@ -90,4 +89,3 @@ class VideoPlayback(Playback):
             if not self._loop:
                 return
             begin_s = time_s + 1.0 / reader.info.fps
-            self._repaired += reader.repaired

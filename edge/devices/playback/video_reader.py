@@ -214,7 +214,8 @@ class VideoReader:
         capture = cv2.VideoCapture(str(self.path))
         rate, count = (capture.get(what) for what in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
         capture.release()
-        return VideoInfo(first[1], self._given_fps or rate, max(int(count), 0))
+        end = count / rate if rate > 0.0 and count > 0.0 else math.nan
+        return VideoInfo(first[1], self._given_fps or rate, max(int(count), 0), end)
 
     def _opencv_frames(self) -> Iterator[_Decoded]:
         capture = cv2.VideoCapture(str(self.path))

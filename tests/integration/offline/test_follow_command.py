@@ -134,6 +134,8 @@ def test_videos_of_nobody_are_a_refusal_and_unknown_videos_bad_input(
     (tmp_path / "door.mp4").unlink()
     write_video(tmp_path / "left.mp4", [picture[:480, :640] for picture in grey], [0.0, 0.2, 0.4])
     assert "this video is 640x480" in refused(["follow", str(tmp_path), *known], 2, capsys)
+    write_video(tmp_path / "left.mp4", [np.ascontiguousarray(np.rot90(picture)) for picture in grey], [0.0, 0.2, 0.4])
+    assert "a copy may have lost its rotation" in refused(["follow", str(tmp_path), *known], 2, capsys)
 
 
 def refused(arguments: list[str], status: int, capsys: pytest.CaptureFixture[str]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
+from deploy.offline.track import corners_for_a_box, parse_target
 from deploy.simulation.flight import write_simulated_flight
 from edge.mavlink.dialect import mavlink
 from protocols.core.jpeg import encode_jpeg
@@ -21,7 +23,7 @@ from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import FLIGHT_IMAGE, TELEMETRY, UAV_INFO
 from tests.support.samples import flight_image, uav_info
-from tests.support.videos import write_video
+from tests.support.videos import TICKS, write_video
 
 SIZE = (320, 240)
 FRAMES = 45
@@ -172,6 +174,22 @@ def test_a_video_file_gives_its_own_times_and_a_larger_overlay(recording: Path, 
     assert sorted(path.name for path in out.iterdir()) == ["hypotheses.csv", "overlay.mp4", "track.csv"]
 
 
+def test_a_clip_that_a_phone_has_trimmed_is_whole(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Phones trim by an edit list; "35 of 45 frames could be decoded"."""
+    images = [cv2.imread(str(file)) for file in sorted((recording / "pictures").iterdir())]
+    write_video(tmp_path / "a.mp4", images, np.arange(FRAMES) / 10)
+    content = bytearray((tmp_path / "a.mp4").read_bytes())
+    edit = content.index(b"elst") + 12
+    duration_ms, begin = struct.unpack_from(">Ii", content, edit)
+    struct.pack_into(">Ii", content, edit, duration_ms - 1000, begin + TICKS)
+    (tmp_path / "a.mp4").write_bytes(content)
+    assert run(["track", str(tmp_path / "a.mp4"), "--target", "152,118,36,16", "--out", str(tmp_path / "out")]) == 0
+    assert "warning" not in capsys.readouterr().out
+    assert len(table(tmp_path / "out" / "track.csv")) == FRAMES - 10
+
+
 def test_an_overlay_of_an_earlier_run_is_removed_and_inputs_are_kept(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -228,6 +246,14 @@ def test_bad_input_gives_one_line_and_exit_status_2(
     assert message in output
     assert "\n" not in output
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("box", ["301,200,22,47", "10,10,44,20", "5,8,200,120"])
+def test_a_box_that_may_be_two_corners_is_warned_of(box: str) -> None:
+    """A quarter of the picture was followed in place of the car, without a word."""
+    [warning] = corners_for_a_box(parse_target("301,200,323,247"), (640, 480))
+    assert warning.endswith("give --target 301,200,22,47")
+    assert not corners_for_a_box(parse_target(box), (640, 480))
 
 
 def test_files_that_are_no_video_are_rejected(
@@ -457,4 +483,4 @@ def test_a_variable_frame_rate_is_no_loss_of_frames(
     content = (tmp_path / "a.mkv").read_bytes()
     (tmp_path / "a.mkv").write_bytes(content[: int(share * len(content))])
     assert run(["track", str(tmp_path / "a.mkv"), "--target", TARGET, "--out", str(tmp_path / "out")]) == 0
-    assert ("frames could be decoded" in capsys.readouterr().out) == (share < 1.0)
+    assert ("seems to be cut off" in capsys.readouterr().out) == (share < 1.0)

@@ -93,6 +93,17 @@ def test_a_camera_that_was_moved_is_reported_and_left_out(session: Path, tmp_pat
     assert np.sqrt(np.mean(off**2)) < 1e-2
 
 
+def test_a_calibration_of_other_cameras_is_named(session: Path, tmp_path: Path, capsys: Capture) -> None:
+    """It ended with a traceback."""
+    tables = tomllib.loads((session / "truth_calibration.toml").read_text())
+    metadata = tables.pop("metadata") | {"reference": "gate0"}
+    known = tmp_path / "known.toml"
+    renamed = {f"gate{index}": table | {"name": f"gate{index}"} for index, table in enumerate(tables.values())}
+    known.write_text(tomli_w.dumps({"metadata": metadata, **renamed}))
+    assert run(["triangulate", str(session), "--calibration", str(known), "--out", str(tmp_path / "track.csv")]) == 2
+    assert "none of its cameras (cam0, cam1, cam2) is in the calibration (gate0, " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("cameras", [["cam2"], ["cam0", "cam1", "cam2"]])
 def test_a_clock_that_was_set_by_years_is_named_at_once(
     session: Path, tmp_path: Path, capsys: Capture, cameras: list[str]

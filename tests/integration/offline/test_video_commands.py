@@ -19,11 +19,12 @@ import pytest
 import tomli_w
 
 from deploy.cli import run
+from deploy.offline.video_folder import list_videos
 from edge.devices.playback.video_reader import VideoReader
 from edge.offline.detections import HEADER
 from edge.scenes.marker.scene import MarkerScene
 from protocols.core.acceptance import PairReport
-from protocols.core.errors import Refused
+from protocols.core.errors import InputError, Refused
 from protocols.geometry.types import Floats
 from tests.support.sounds import add_sound, heard, sound_events
 from tests.support.videos import Image, numbered_image, read_number, record_scene_videos, write_video
@@ -86,6 +87,17 @@ def test_warnings_name_the_videos_that_cannot_be_used(recorded: RecordedVideos) 
     assert "broken.mp4: no frame can be read" in warnings
     assert "wall.mp4: no ball" in warnings
     assert toml(recorded.out / "calibration.toml")["metadata"]["refused"]["wall"] == "no observations"
+
+
+@pytest.mark.parametrize("names", [("GH010042", "GH020042"), ("GOPR0042", "GP010042")])
+def test_chapters_of_one_recording_are_no_cameras(names: tuple[str, str], tmp_path: Path) -> None:
+    """Each was taken for a camera, and of the longest recordings most was left out for want of a common time."""
+    for name in ("GH010041", "GX010042", *names):
+        (tmp_path / f"{name}.MP4").write_bytes(name.encode())
+    with pytest.raises(InputError, match=f"{names[0]}.MP4 and {names[1]}.MP4 are chapters of one recording; join"):
+        list_videos(tmp_path)
+    (tmp_path / f"{names[1]}.MP4").unlink()
+    assert len(list_videos(tmp_path)[0]) == len(list(tmp_path.iterdir()))
 
 
 def test_detections_of_unchanged_videos_are_reused(recorded: RecordedVideos, tmp_path: Path, capsys: Capture) -> None:
@@ -438,6 +450,27 @@ def test_lags_that_are_not_known_are_refused_as_such_and_not_for_want_of_lenses(
     message = capsys.readouterr().err
     assert "the lag of no pair of these videos is known (cam0 and cam1: two alignments are about as good)" in message
     assert "intrinsics" not in message
+
+
+def test_a_video_whose_lag_is_not_known_is_left_out_for_that_and_not_for_want_of_a_lens(
+    without_lenses: tuple[Path, Path, str], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a phone that was held by hand it said to run `syncline intrinsics`."""
+    folder, out, _ = without_lenses
+    shutil.copytree(out / "session", tmp_path / "sync" / "timing" / "session")
+    videos = tmp_path / "videos"
+    shutil.copytree(folder, videos)
+    write_video(videos / "hand.mp4", [np.full((64, 96, 3), 90, np.uint8)] * 20, np.arange(20) / 10)
+
+    def refuse(*_: object, **__: object) -> None:
+        pairs = (PairReport(("cam0", "cam1"), "ok", 0.1, 1.0), PairReport(("cam1", "hand"), "too little agrees"))
+        raise Refused("fewer than two cameras", {"hand": "no intrinsics: run `syncline intrinsics`"}, pairs=pairs)
+
+    monkeypatch.setattr("hub.api.calibrate", refuse)
+    assert run(["sync", str(videos), "--videos", "none", "--out", str(tmp_path / "sync")]) == 0
+    printed = capsys.readouterr().out
+    assert "warning: hand.mp4: its lag is not known (with cam1: too little agrees); left out" in printed
+    assert "intrinsics" not in printed
 
 
 def test_videos_in_which_nothing_moves_are_synchronised_by_their_sounds(tmp_path: Path, capsys: Capture) -> None:

@@ -226,6 +226,20 @@ def test_a_head_below_its_foot_is_named_with_its_line(tmp_path: Path) -> None:
     text = "camera,frame,time,u,v,label\nleft,0,0,50,90,ann-head\nleft,0,0,52,20,ann-foot\n"
     with pytest.raises(InputError, match=r"rows.csv:3: ann: the head is not above the foot"):
         read_objects(rows(tmp_path, text), SIZES)
+    ceiling = text + "left,1,1,50,20,ann-head\nleft,1,1,52,90,ann-foot\n"
+    assert len(read_objects(rows(tmp_path, ceiling), SIZES)) == 4
+
+
+def test_boxes_of_cameras_that_look_down_are_what_may_be_wrong(tmp_path: Path) -> None:
+    """Where nobody was found in them, calibration and clocks were suspected alone."""
+    file = write_calibration(tmp_path / "calibration.toml")
+    messages = object_messages(read_objects(rows(tmp_path, boxes_csv(1.0)), SIZES))
+    assert units.boxes_from_above(messages, read_given_calibration(file)) == ""
+    tables = tomllib.loads(file.read_text(encoding="utf-8"))
+    down = Pose(look_at_pose(np.array([0.01, 0.0, 5.0]), np.zeros(3)).rotation, np.array([0.01, 0.0, 5.0]))
+    tables["left"] |= {"rotation": down.rodrigues.tolist(), "translation": down.translation.tolist()}
+    file.write_text(tomli_w.dumps(tables), encoding="utf-8")
+    assert "look down steeply (left)" in units.boxes_from_above(messages, read_given_calibration(file))
 
 
 @pytest.mark.parametrize("scale", [0.001, 100.0, 1000.0, 3.281, 39.37])

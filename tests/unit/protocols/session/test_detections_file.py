@@ -51,7 +51,6 @@ def test_the_short_form_of_the_file_is_read_too(tmp_path: Path) -> None:
         ({"cov_uu": ""}, "cov_uu is empty; give all of cov_uu, cov_uv, cov_vv, or none"),
         ({"head_v": ""}, "head_v is empty"),
         ({"head_v": "1e7"}, "beyond"),
-        ({"head_v": "200"}, "the head is not above the foot"),
         ({"box_w": "0"}, "a box of 0 x 100 px"),
         ({"box_x": "640"}, "outside the 640x480 image"),
         ({"box_y": "inf"}, "box_y is inf"),
@@ -64,6 +63,19 @@ def test_a_bad_value_is_one_line_with_its_place(tmp_path: Path, changed: dict[st
         read(tmp_path, PERSON, ",".join(cells.values()))
     assert caught.value.line == 3
     assert "\n" not in str(caught.value)
+
+
+def test_heads_that_are_below_their_feet_are_named_with_the_line_of_the_first(tmp_path: Path) -> None:
+    swapped = dict(zip(HEADER.split(","), PERSON.split(","), strict=True)) | {"head_v": "200"}
+    with pytest.raises(InputError, match="the head is not above the foot") as caught:
+        read(tmp_path, *[",".join(swapped.values())] * 2)
+    assert caught.value.line == 2
+
+
+def test_below_a_ceiling_camera_some_heads_are_below_their_feet(tmp_path: Path) -> None:
+    """A hall with cameras on the ceiling was refused: "the head is not above the foot"."""
+    away = dict(zip(HEADER.split(","), PERSON.split(","), strict=True)) | {"head_v": "200"}
+    assert len(read(tmp_path, PERSON, ",".join(away.values()))) == 2
 
 
 def test_a_camera_on_its_side_has_its_heads_beside_the_feet(tmp_path: Path) -> None:

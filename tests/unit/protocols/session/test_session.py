@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hub.api import calibrate, triangulate
+from hub.api import CalibrationOptions, calibrate, triangulate
 from protocols.core.errors import InputError, Refused
 from protocols.geometry.types import Floats
 from protocols.session.session import Session
@@ -66,6 +66,22 @@ def test_a_bad_name_or_size_in_the_rig_is_named() -> None:
         Session.from_table({"../evil": {"size": [640, 480]}}, columns())
     with pytest.raises(InputError, match="size is missing"):
         Session.from_table({"CVLab1": {"fps": 30.0}}, columns())
+
+
+def test_a_rig_that_is_no_dict_of_cameras_is_named_and_cameras_may_be_numbers() -> None:
+    for rig in ([*RIG], {"CVLab1": np.eye(3)}):
+        with pytest.raises(InputError, match="not a dict with a dict for each camera"):
+            Session.from_table(rig, columns())  # type: ignore[arg-type]
+    numbered: dict[Any, Any] = {0: {"size": [640, 480]}, 1: {"size": [640, 480], "distortion": [0.1, 0, 0, 0, 0]}}
+    session = Session.from_table(numbered, columns(camera=[0, 1, 0, 0]))
+    assert list(session.rig.cameras) == ["0", "1"]
+    assert [one for one in session.warnings if "did you mean distortions?" in one]
+
+
+def test_a_solver_that_does_not_exist_is_named() -> None:
+    """It was solved by "joint", and the result said otherwise."""
+    with pytest.raises(InputError, match="there is no solver 'Distributed'; use one of joint, distributed, paper"):
+        calibrate(Session.from_table(RIG, columns()), CalibrationOptions("Distributed"))  # type: ignore[arg-type]
 
 
 def test_too_little_is_refused_and_a_session_has_its_own_observations() -> None:
