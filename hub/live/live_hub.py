@@ -280,8 +280,9 @@ class LiveHub:
         cameras = self.stream.marker.cameras
         if self.unverified:
             assert self._reloaded is not None
-            rows = [self.stream.marker.rows(name) for name in self._reloaded.calibration.cameras]
-            return "" if sum(count >= VERIFY_ROWS for count in rows) >= 2 else "verifying the reloaded calibration"
+            held, least = self._held, VERIFY_ROWS if self._has_marker() else _MIN_PEOPLE_S
+            enough = sum(held(name) >= least for name in self._reloaded.calibration.cameras) >= 2
+            return "" if enough else "verifying the reloaded calibration"
         if len(cameras) < 2:
             return f"{len(cameras)} of at least 2 cameras heard of"
         rows_by_camera = {name: self.stream.marker.rows(name) for name in cameras}
@@ -738,6 +739,10 @@ class LiveHub:
     def _has_marker(self) -> bool:
         """Whether to calibrate from markers: there are enough marker detections, or no people."""
         return self.stream.has_marker(self.settings.least_rows)
+
+    def _held(self, camera: str) -> float:
+        """Of a camera, the detections of markers or the seconds of people that are held to calibrate from."""
+        return self.stream.marker.rows(camera) if self._has_marker() else self.stream.people.seconds(camera)
 
     def _build_session(self) -> tuple[Rig, Observations]:
         """The rig and the observations: of the marker or, if there is none, of people."""
