@@ -427,6 +427,8 @@ class LiveHub:
         if self._schedule.left_out:
             out.append(f"{self._schedule.left_out} is left out: the solver failed with its rows")
         out += [*self.links.notices.values(), *self.links.standing.values(), *self._pixel_faults.values()][:8]
+        if self._known is not None:
+            out += list(self._other_sizes().values())[:8]
         if self._known_faults:
             out.append(f"the given calibration: {'; '.join(self._known_faults[:4])}")
         if self.solver.busy and now - self._submitted_at > _BEHIND_S:
@@ -754,7 +756,8 @@ class LiveHub:
 
         Their rows would make the answer wrong, or the camera be waited for without end.
         """
-        faults = self._pixel_faults = {name: str(one) for name, one in pixel_faults(rig, observations).items()}
+        faults = {name: str(one) for name, one in pixel_faults(rig, observations).items()} | self._other_sizes()
+        faults = self._pixel_faults = {name: why for name, why in faults.items() if name in rig.cameras}
         for name in faults:
             rig, observations = without_camera(rig, observations, name)
         if faults and len(observations.cameras) < 2:
@@ -762,6 +765,16 @@ class LiveHub:
         if small := small_pictures(rig, observations):
             self._pixel_faults = {**faults, "": small}
         return rig, observations
+
+    def _other_sizes(self) -> dict[str, str]:
+        """By camera whose images are of another size than the hub's own file is for, both sizes in words."""
+        out = {}
+        for name, camera in ({} if self._rig is None else self._rig.cameras).items():
+            size = self.stream.image_size(name)
+            if size not in (None, camera.size):
+                sent, given = ("{}x{}".format(*one) for one in (size, camera.size))
+                out[name] = f"{name} sends images of {sent}, and its lens in the hub's file is for {given}"
+        return out
 
     def _source(self) -> SessionBuilder | PeopleTracklets:
         return self.stream.marker if self._has_marker() else self.stream.people
