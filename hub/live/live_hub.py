@@ -532,7 +532,8 @@ class LiveHub:
             kept = {
                 name: one for name, one in start.cameras.items() if name in rig.cameras or name not in heard.cameras
             }
-            start = replace(start, cameras=kept)
+            # A walker's number is its job's: under it another one's path would be taken for the one published before.
+            start = replace(start, cameras=kept, trajectories=start.trajectories if self._has_marker() else ())
         job = SolverJob(
             self._jobs + 1,
             rig,
