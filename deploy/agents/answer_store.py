@@ -53,8 +53,8 @@ class AnswerStore:
         clocks = {"boot_ids": dict(boot_ids), "delays": dict(delays), "kept_unix_s": time.time()}
         self._pending = self._writer.submit(self._write, calibration, rig, clocks)
 
-    def load(self, of_any_age: bool = False) -> tuple[Calibration, dict[str, str], dict[str, float]] | None:
-        """The last answer with its boot ids and delays, if it is recent, or of any age, and readable."""
+    def load(self, of_any_age: bool = False) -> tuple[Calibration, dict[str, str], dict[str, float], Rig] | None:
+        """The last answer with its boot ids, delays and rig, if it is recent, or of any age, and readable."""
         file = self.folder / LAST
         try:
             if not file.is_file() or not (of_any_age or abs(time.time() - file.stat().st_mtime) <= _MAX_AGE_S):
@@ -70,7 +70,7 @@ class AnswerStore:
         self.kept_unix_s = float(kept) if isinstance(kept, int | float) else file.stat().st_mtime
         calibration = Calibration(cameras, metadata["reference"], metadata["scale"], rig.units, "joint", VERSION)
         seconds = {name: float(delay) for name, delay in delays.items() if isinstance(delay, int | float)}
-        return calibration, {name: str(boot) for name, boot in boots.items()}, seconds
+        return calibration, {name: str(boot) for name, boot in boots.items()}, seconds, rig
 
     def close(self) -> None:
         """Wait for the last answer to be written."""

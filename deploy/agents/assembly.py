@@ -146,8 +146,8 @@ def start_hub(config: HubConfig, bus: Bus, stop: threading.Event, beat: Callable
         hub.reload(*last, arrival=store.kept_unix_s if goes_on else None)
 
     def keep(hub: LiveHub) -> None:
-        if config.solve and known is None and hub.calibration is not None and hub.session is not None:
-            store.keep(hub.calibration, hub.session[0], hub.boot_ids, hub.delays)
+        if config.solve and known is None and (found := hub.for_files()) is not None:
+            store.keep(found[0], found[1], hub.boot_ids, hub.delays)
         note(hub)
 
     def note(hub: LiveHub) -> None:
@@ -187,13 +187,13 @@ def write_last(hub: object, out: Path) -> None:
     assert isinstance(hub, LiveHub)
     if hub.session is None:
         return
-    session = Session(*hub.session)
-    if hub.calibration is not None:
-        report_result(CalibrationResult(on_present_clock(hub.calibration), session), out, "syncline hub")
+    if (found := hub.for_files()) is not None:
+        calibration, rig, observations = found
+        report_result(CalibrationResult(on_present_clock(calibration), Session(rig, observations)), out, "syncline hub")
     elif hub.refusal is not None and (earlier := out / "calibration.toml").exists():
         print(f"no answer: {hub.refusal.reason}; kept: {earlier}, of before")
     elif hub.refusal is not None:
-        report_refusal(hub.refusal, session, out, "syncline hub")
+        report_refusal(hub.refusal, Session(*hub.session), out, "syncline hub")
 
 
 def make_device(config: CameraConfig, intrinsics: Intrinsics | None) -> Device:

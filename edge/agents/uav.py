@@ -213,7 +213,7 @@ class UavAgent:
             problem = vehicle.problem(self._now_ns()) or contradiction or reason or height
             state = "degraded" if contradiction or problem.startswith("no attitude") else state
             message = problem or self._guidance.hold_reason or "commands are sent"
-            second = link.second_autopilot(self._now_ns())
+            second = link.second_sender(self._now_ns())
             message += f"; {second}" if second else ""
         counters: Counter[str] = Counter(self.counters)
         for prefix, part in (

@@ -94,6 +94,11 @@ class ObservationStream:
         """Whether a camera has introduced itself: without its image size it is not calibrated."""
         return camera in self._infos
 
+    def image_size(self, camera: str) -> tuple[int, int] | None:
+        """Width and height [px] of the images that a camera has said it sends; None where it has not."""
+        info = self._infos.get(camera)
+        return None if info is None else (info.width, info.height)
+
     def arrivals(self, boots: Mapping[str, str]) -> dict[str, ExternalClockPrior]:
         """Clock priors by times of arrival, of the clocks with the given boot ids."""
         return {name: prior for name, prior in self._arrivals.priors().items() if prior.boot_id == boots.get(name)}

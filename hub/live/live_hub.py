@@ -34,7 +34,7 @@ from protocols.session.builder import LONG_FILM_S, SessionBuilder
 from protocols.session.calibration import Calibration, CameraCalibration, stated_calibration, stated_up
 from protocols.session.folder import pixel_faults, small_pictures
 from protocols.session.observations import Observations
-from protocols.session.rig import Rig
+from protocols.session.rig import Rig, RigCamera
 
 HubState = Literal["collecting", "searching", "calibrated", "degraded", "refused"]
 
@@ -51,6 +51,7 @@ _CHECK_EVERY_S = 60.0  # s: between two tests of a given calibration, which take
 _BUDGET_NOTICE_S = 10.0
 """How long the status names a camera that exceeded its budget."""
 _UNSEEN = "pose and clock are of an earlier answer, no detections since"
+_RESTARTED = "restarted and not located since: pose and clock are of an earlier answer, before the restart"
 _MAX_STD_GROWTH = 1.5
 """An answer whose stds are larger than the present one's by this factor is not taken: its rows say less."""
 
@@ -140,6 +141,10 @@ class LiveHub:
         self.calibrated_at = self._now
         """When the present calibration was estimated or, of a given one, began to be used."""
         self._solved_boot_ids: dict[str, str] = {}
+        self._restarted: dict[str, CameraCalibration] = {}
+        """By camera whose clock is another one since, until it is located again: as it was before."""
+        self._rig_cameras: dict[str, RigCamera] = {}
+        """Of all answers so far, the reloaded one included."""
         self._reloaded: ReloadedCalibration | None = None
         if self._known is not None:
             self._use_known(self._known)
@@ -208,6 +213,7 @@ class LiveHub:
         for name in cameras:
             self.stream.release(name)
             self.links.last_frame.pop(name, None)
+            self._restarted.pop(name, None)
         if self.calibration is not None:
             kept = {name: one for name, one in self.calibration.cameras.items() if name not in cameras}
             self.calibration = replace(self.calibration, cameras=kept) if len(kept) > 1 else None
@@ -239,7 +245,7 @@ class LiveHub:
         """Go on from another hub's answer, about other cameras than before. boot_ids: of the clocks of its maps."""
         self._superseded, self._answer_rows, self._reloaded, self.refusal = self._jobs, 0.0, None, None
         self.calibration = calibration if len(calibration.cameras) > 1 else None
-        self._solved_boot_ids = dict(boot_ids)
+        self._solved_boot_ids, self._restarted = dict(boot_ids), {}
         self._clock_stepped = self.calibration is not None  # published with the next tick
 
     def reload(
@@ -247,18 +253,21 @@ class LiveHub:
         calibration: Calibration,
         boot_ids: dict[str, str],
         delays: dict[str, float],
+        rig: Rig | None = None,
         *,
         arrival: float | None = None,
     ) -> None:
         """Go on with an earlier answer, unverified until the first consistent second.
 
-        boot_ids, delays: of its cameras then; cameras that were restarted since, or whose clock was set, are left out.
-        arrival: the hub's clock at those delays [s]; where it is given, such cameras come to their new clocks by the
-        delays then and now. A hub that was killed tracks again at once.
+        boot_ids, delays, rig: of its cameras then; those that were restarted since, or whose clock was set, are left
+        out. arrival: the hub's clock at those delays [s]; where it is given, such cameras come to their new clocks by
+        the delays then and now. A hub that was killed tracks again at once.
         """
         if self._known is None and self.calibration is None:
             self._reloaded = ReloadedCalibration(calibration, dict(boot_ids), dict(delays), arrival)
             self._earlier_delays = dict(delays)
+            if rig is not None:
+                self._rig_cameras = {name: unplaced(camera) for name, camera in rig.cameras.items()}
 
     def clock_contradictions(self) -> list[str]:
         """Cameras whose external clock prior (NTP/PTP) the calibration contradicts, one line each."""
@@ -271,8 +280,9 @@ class LiveHub:
         cameras = self.stream.marker.cameras
         if self.unverified:
             assert self._reloaded is not None
-            rows = [self.stream.marker.rows(name) for name in self._reloaded.calibration.cameras]
-            return "" if sum(count >= VERIFY_ROWS for count in rows) >= 2 else "verifying the reloaded calibration"
+            held, least = self._held, VERIFY_ROWS if self._has_marker() else _MIN_PEOPLE_S
+            enough = sum(held(name) >= least for name in self._reloaded.calibration.cameras) >= 2
+            return "" if enough else "verifying the reloaded calibration"
         if len(cameras) < 2:
             return f"{len(cameras)} of at least 2 cameras heard of"
         rows_by_camera = {name: self.stream.marker.rows(name) for name in cameras}
@@ -342,8 +352,31 @@ class LiveHub:
 
     @property
     def delays(self) -> dict[str, float]:
-        """By camera, the last known delay [s] (`CameraLinks`), also of those not heard since this hub was started."""
-        return self._earlier_delays | self.links.delays
+        """By camera, the last known delay [s] (`CameraLinks`), also of those not heard since this hub was started.
+
+        Not of those in another run than the one that `boot_ids` says.
+        """
+        delays = self._earlier_delays | self.links.delays
+        return {name: delay for name, delay in delays.items() if name not in self._restarted}
+
+    def for_files(self) -> tuple[Calibration, Rig, Observations] | None:
+        """The present answer and the session that it is of; None without one.
+
+        With the last poses of the cameras that were restarted and are not located again: whoever copies the file in
+        that moment does not lose them.
+        """
+        if self.calibration is None or self.session is None:
+            return None
+        found, (rig, observations) = self.calibration, self.session
+        if self._restarted:
+            found = replace(
+                found,
+                cameras=found.cameras | self._restarted,
+                refused={name: why for name, why in found.refused.items() if name not in self._restarted},
+                warnings=(*found.warnings, f"{listed(sorted(self._restarted))}: {_RESTARTED}"),
+            )
+        cameras = {name: one for name, one in self._rig_cameras.items() if name in found.cameras} | rig.cameras
+        return found, replace(rig, cameras=cameras), observations
 
     @property
     def unverified(self) -> bool:
@@ -394,6 +427,8 @@ class LiveHub:
         if self._schedule.left_out:
             out.append(f"{self._schedule.left_out} is left out: the solver failed with its rows")
         out += [*self.links.notices.values(), *self.links.standing.values(), *self._pixel_faults.values()][:8]
+        if self._known is not None:
+            out += list(self._other_sizes().values())[:8]
         if self._known_faults:
             out.append(f"the given calibration: {'; '.join(self._known_faults[:4])}")
         if self.solver.busy and now - self._submitted_at > _BEHIND_S:
@@ -497,7 +532,8 @@ class LiveHub:
             kept = {
                 name: one for name, one in start.cameras.items() if name in rig.cameras or name not in heard.cameras
             }
-            start = replace(start, cameras=kept)
+            # A walker's number is its job's: under it another one's path would be taken for the one published before.
+            start = replace(start, cameras=kept, trajectories=start.trajectories if self._has_marker() else ())
         job = SolverJob(
             self._jobs + 1,
             rig,
@@ -610,9 +646,11 @@ class LiveHub:
             self.counters["not_better"] += 1
             return [event]
         self.counters["verified" if job.verify else "solved"] += 1
+        then = self._keep_restarted(job, found)
         self._reloaded = None
         self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
         self.session = job.rig, job.observations
+        self._rig_cameras |= job.rig.cameras
         if unseen := found.cameras.keys() - set(job.observations.cameras):
             found = replace(found, warnings=(*found.warnings, f"{listed(sorted(unseen))}: {_UNSEEN}"))
         if job.last is None and self.calibration is not None and self.tracking is not None and not self.is_shard:
@@ -620,8 +658,25 @@ class LiveHub:
         self._report_steps(found)
         self.calibration, self.calibrated_at = found, now
         known = self._solved_boot_ids | boots
-        self._solved_boot_ids = {name: known[name] for name in found.cameras if name in known}
+        self._solved_boot_ids = then | {name: known[name] for name in found.cameras if name in known}
         return [event, *self._publish_present()]
+
+    def _keep_restarted(self, job: SolverJob, found: Calibration) -> dict[str, str]:
+        """Keep the poses of cameras with which the job did not begin because their clocks are others; their boots then.
+
+        In a new world they mean nothing.
+        """
+        before = {} if self.calibration is None else self.calibration.cameras
+        boots = self._solved_boot_ids
+        if self._reloaded is not None:
+            before, boots = self._reloaded.calibration.cameras | before, {**self._reloaded.boots, **boots}
+        last = None if job.last is None else job.last.cameras
+        self._restarted = {
+            name: camera
+            for name, camera in (before | self._restarted).items()
+            if last is not None and name in job.rig.cameras and name not in last and name not in found.cameras
+        }
+        return {name: boots[name] for name in self._restarted if name in boots}
 
     def _report_steps(self, found: Calibration) -> None:
         """Count the clock steps that the images show and raise an alarm for each, once."""
@@ -688,6 +743,10 @@ class LiveHub:
         """Whether to calibrate from markers: there are enough marker detections, or no people."""
         return self.stream.has_marker(self.settings.least_rows)
 
+    def _held(self, camera: str) -> float:
+        """Of a camera, the detections of markers or the seconds of people that are held to calibrate from."""
+        return self.stream.marker.rows(camera) if self._has_marker() else self.stream.people.seconds(camera)
+
     def _build_session(self) -> tuple[Rig, Observations]:
         """The rig and the observations: of the marker or, if there is none, of people."""
         rig, observations = self.stream.build(self._has_marker() or not self.settings.solve)
@@ -698,7 +757,8 @@ class LiveHub:
 
         Their rows would make the answer wrong, or the camera be waited for without end.
         """
-        faults = self._pixel_faults = {name: str(one) for name, one in pixel_faults(rig, observations).items()}
+        faults = {name: str(one) for name, one in pixel_faults(rig, observations).items()} | self._other_sizes()
+        faults = self._pixel_faults = {name: why for name, why in faults.items() if name in rig.cameras}
         for name in faults:
             rig, observations = without_camera(rig, observations, name)
         if faults and len(observations.cameras) < 2:
@@ -706,6 +766,16 @@ class LiveHub:
         if small := small_pictures(rig, observations):
             self._pixel_faults = {**faults, "": small}
         return rig, observations
+
+    def _other_sizes(self) -> dict[str, str]:
+        """By camera whose images are of another size than the hub's own file is for, both sizes in words."""
+        out = {}
+        for name, camera in ({} if self._rig is None else self._rig.cameras).items():
+            size = self.stream.image_size(name)
+            if size not in (None, camera.size):
+                sent, given = ("{}x{}".format(*one) for one in (size, camera.size))
+                out[name] = f"{name} sends images of {sent}, and its lens in the hub's file is for {given}"
+        return out
 
     def _source(self) -> SessionBuilder | PeopleTracklets:
         return self.stream.marker if self._has_marker() else self.stream.people
@@ -755,6 +825,11 @@ class LiveHub:
         source = self._source()
         boots = {name: self._solved_boot_ids.get(name) or source.boot(name) for name in calibration.cameras}
         return self.stream.clocks.to_present(calibration, boots, until)
+
+
+def unplaced(camera: RigCamera) -> RigCamera:
+    """A camera of a calibration.toml as the rig has it: its pose there is an estimate, and no reference."""
+    return replace(camera, position=None, rotation=None, position_std=None, rotation_std=None)
 
 
 def without_camera(rig: Rig, observations: Observations, camera: str) -> tuple[Rig, Observations]:

@@ -142,6 +142,19 @@ def test_a_bad_link_loses_nothing(ends: Ends, name: str, rules: dict[str, float]
     assert sequences == list(range(put))
 
 
+def test_a_router_is_reached_over_a_long_way(tmp_path: Path) -> None:
+    """800 ms there and back, as over two satellites: no attempt was long enough, and "no router answers" was wrong."""
+    with ExitStack() as stack:
+        near, far, link = stack.enter_context(bad_link(tmp_path))
+        stack.enter_context(router(tmp_path, ENDPOINT, far))
+        link.set(delay_s=0.4)
+        began = time.monotonic()
+        connected = bool(stack.enter_context(receiver(ENDPOINT, namespace=near)).line())
+        took = time.monotonic() - began
+    measured("router 800 ms there and back", "reached", f"reached after {took:.1f} s" if connected else "not reached")
+    assert connected
+
+
 @contextmanager
 def slow_link(endpoint: str, bytes_per_s: float) -> Iterator[str]:
     """An endpoint in front of another, from which bytes come no faster."""

@@ -28,7 +28,7 @@ _LEAST_RATE = 0.5  # of the requested rate: one message in two may be lost
 class Heard:
     """What was heard on a link. samples: times of attitudes [s]. stations: ids of ground stations' heartbeats.
 
-    second: the other autopilot on it. gimbal: whether one reports. ignores_unsigned: see ``Vehicle``.
+    second: who else is on it (`Link.second_sender`). gimbal: whether one reports. ignores_unsigned: see ``Vehicle``.
     """
 
     firmware: str = "the autopilot"
@@ -61,7 +61,7 @@ def check(config: Any, patience_s: float = 3.0, listen_s: float = 2.5) -> Iterat
     # silent assumes a lost link and returns home.
     link = Link(
         url,
-        system=None,
+        system=settings.system,
         component=CAMERA,
         allowed=(*MESSAGE_TYPES, "PARAM_VALUE"),
         signing=signing,
@@ -152,7 +152,7 @@ def listen(link: Any, hello: Any, *, gimbal: bool, rate_hz: float, seconds: floa
         link.wait(0.05)
     heard.synchronised = vehicle.clock.answered
     heard.ignores_unsigned = vehicle.ignores_unsigned
-    heard.refusal, heard.second = vehicle.problem(time.monotonic_ns()), link.second_autopilot(time.monotonic_ns())
+    heard.refusal, heard.second = vehicle.problem(time.monotonic_ns()), link.second_sender(time.monotonic_ns())
     return heard
 
 
@@ -190,7 +190,7 @@ def telemetry(heard: Heard, *, gimbal: bool, rate_hz: float) -> CheckResult:
 def unused(heard: Heard, followed: int | None, *, gimbal: bool) -> Iterator[CheckResult]:
     """Warn of another vehicle, and of a gimbal, where neither is used and the settings may have meant it."""
     if heard.second:
-        remedy = "set vehicle in [mavlink] to the system that carries the camera"
+        remedy = "set vehicle in [mavlink] to the system that carries the camera, and system to the camera's own"
         yield warn("vehicle", f"system {followed} is followed; {heard.second}", remedy)
     if heard.gimbal and not gimbal:
         remedy = 'set mount = "gimbal" if the camera hangs on it'

@@ -103,8 +103,14 @@ class Link:
         self.vehicle = vehicle
         self.last_received_ns = 0
         self.counters: Counter[str] = Counter()
+        self._beat_sequence = -1
         self._outbox = Outbox(capacity(url), self.counters)
         self.problem = ""
+
+    @property
+    def system(self) -> int | None:
+        """The own system id; None while it is that of a vehicle that is not known yet."""
+        return self.vehicle if self._as_vehicle else int(self._codec.srcSystem)
 
     @property
     def open(self) -> bool:
@@ -178,8 +184,8 @@ class Link:
             return text
         return "" if self._signing is None else self._signing.problem
 
-    def second_autopilot(self, now_ns: int) -> str:
-        """Which other vehicle's autopilot is on the link, where ``vehicle`` is not set; "" if there is none."""
+    def second_sender(self, now_ns: int) -> str:
+        """Who else has this component's ids, or which other vehicle is there, where ``vehicle`` is not set; or ""."""
         since, text = self._second
         return text if now_ns - since < _CONFLICT_SHOWN_NS else ""
 
@@ -190,6 +196,8 @@ class Link:
                 self._codec.signing.timestamp = self._signing.next_time(self._unix_s())
             if self._as_vehicle and self.vehicle is not None:
                 self._codec.srcSystem = self.vehicle
+            if message.get_type() == "HEARTBEAT":
+                self._beat_sequence = self._codec.seq
             data = bytes(message.pack(self._codec))
             try:
                 if not self._transport.send(data, self._reply_address or self._address):
@@ -254,6 +262,10 @@ class Link:
             self._identity.add(message, now)
             if self._signing is None and frame[0] == V2 and frame[2] & SIGNED:
                 self.counters["signed"] += 1  # which cannot be verified
+        own_ids = (system, component) == (self.system, self._codec.srcComponent)
+        if kind == "HEARTBEAT" and own_ids and message.get_seq() != self._beat_sequence:  # no echo
+            text = f"another component {component} of system {system} is on this link: stations reach both as one"
+            self._second = (now, f"{text}; set system in [mavlink], or the other one's component id")
         self.counters["received"] += 1
         return ReceivedMessage(message, kind, system, component, now)
 

@@ -164,7 +164,7 @@ class CameraComponent:
             self._rates.hear(station, now_s, new=message.type == mavlink.MAV_TYPE_GCS)
         if received.kind not in ("COMMAND_LONG", "COMMAND_INT"):
             return
-        if message.target_system not in (0, self._link.vehicle) or message.target_component not in (0, CAMERA):
+        if message.target_system not in (0, self._link.system) or message.target_component not in (0, CAMERA):
             return
         for_us = message.target_component == CAMERA
         if self._stations and received.system not in self._stations and received.system != self._link.vehicle:

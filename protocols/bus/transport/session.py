@@ -21,9 +21,10 @@ from protocols.core.errors import InputError
 MAX_MESSAGE_SIZE = 4 * 1024 * 1024  # bytes: eight of the largest pictures
 LEASE_MS = 1900
 """A frozen process counts as gone after this and is reported within 2 s; a killed one at once."""
-_ATTEMPTS_MS = (100, 1000, 2000)
+_ATTEMPTS_MS = (100, 1000, 2000, 4000)
 """Timeouts of a client's attempts to reach its router. The first is short, so that a refusal is reported at once; the
-later ones are long enough for a link of 300 ms, over which a handshake takes four times that."""
+later ones are long enough for a link of 300 ms there and back, over which a handshake takes four times that, and the
+last for one of 800 ms."""
 _OPEN_TIMEOUT_MS = 4000
 """Timeout of one connection attempt. TCP doubles its retransmission pause where a first packet is lost, so an attempt
 that began on a bad link waits for seconds after the link has recovered; a new one does not. Long enough for 800 ms."""

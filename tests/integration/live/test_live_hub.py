@@ -274,6 +274,26 @@ def test_a_camera_whose_pixels_are_of_another_image_is_named(
     assert reason in next(one.reason for one in hub.progress() if one.camera == "cam3")
 
 
+@pytest.mark.parametrize("known", [False, True])
+def test_a_camera_that_sends_other_images_than_the_hubs_file_is_for_is_named(session: Session, known: bool) -> None:
+    """720p where rig.toml has the lens of 1080p: it was calibrated, turned by 12 degrees, and nothing said so."""
+    cameras, lens = dict(session.rig.cameras), session.lens("cam1")
+    matrix = lens.matrix * np.array([[1.5], [1.5], [1.0]])
+    larger = replace(lens, width=1920, height=1080, matrix=matrix)
+    cameras["cam1"] = replace(cameras["cam1"], size=(1920, 1080), intrinsics=larger)
+    rig = replace(session.rig, cameras=cameras)
+    hub = LiveHub(SETTINGS, rig)
+    feed(hub, messages(session))
+    assert hub.calibration is not None
+    if known:
+        given = hub.calibration.cameras
+        hub = LiveHub(SETTINGS, known=KnownCalibration(replace(rig, metadata={"reference": "cam0"}), given))
+        feed(hub, messages(session))
+    else:
+        assert set(hub.calibration.cameras) == {"cam0", "cam2"}
+    assert "cam1 sends images of 1280x720, and its lens in the hub's file is for 1920x1080" in hub.state(1e6)[1]
+
+
 def test_pictures_of_another_size_are_refused_by_a_hub_too() -> None:
     """Half the pixels of all cameras gave an answer of two of them, with a clock step that none had."""
     stream = messages(simulate(3, 4, 30.0))

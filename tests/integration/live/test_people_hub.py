@@ -16,6 +16,7 @@ from deploy.simulation.session import camera_tables
 from edge import scenes
 from hub.live.agent import run_hub, status_message
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
+from hub.live.solver import SolverJob
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
@@ -25,7 +26,7 @@ from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.calibration import read_calibration
+from protocols.session.calibration import Calibration, read_calibration
 from protocols.topics import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
 from tests.support.people_traffic import Traffic, film
 from tests.support.samples import camera_info, eventually
@@ -120,6 +121,37 @@ def test_a_calibration_is_for_the_hub_only(
     out = ["--out", str(tmp_path / "x.mcap")] if through else []
     assert run(["replay", str(log), *through, *out, "--calibration", str(known)]) == 2
     assert "--calibration goes with --through hub" in capsys.readouterr().err
+
+
+def test_a_reloaded_answer_is_verified_by_people_where_there_is_no_marker(known: Path) -> None:
+    """It waited for markers: a restarted hub of such a rig was "not verified yet" for good, and solved nothing more.
+
+    And walkers are numbered anew by each job: answers were mapped onto other people's paths, all cameras to one point.
+    """
+    traffic, cameras = film(SCENE, 23.0, 21), read_calibration(known)[1]
+    delays = {message.camera: 1e9 + at - message.device_time_ns / NANOSECONDS for at, message in traffic.arrivals}
+    answer = Calibration(cameras, traffic.reference, "metric", "m", "joint", "1")
+    hub, jobs = LiveHub(), list[SolverJob]()
+    submit = hub.solver.submit
+    hub.solver.submit = lambda job, now: (jobs.append(job), submit(job, now))[1]  # type: ignore[method-assign,func-returns-value]
+    hub.reload(answer, dict.fromkeys(cameras, "boot0"), delays)
+    for info in traffic.infos:
+        hub.handle(info)
+    states = set()
+    for at, message in traffic.arrivals:
+        hub.handle(message, 1e9 + at)
+        hub.tick(at)
+        states.add(hub.state(at)[0])
+        if hub.counters["verified"]:
+            break
+    assert "degraded" in states
+    assert hub.state(at) == ("calibrated", "4 cameras calibrated")
+    for later in (2.0, 4.0):
+        hub.tick(at + later, final=True)
+    assert hub.counters["solved"] == 2
+    assert hub.calibration is not None
+    assert hub.calibration.trajectories
+    assert [job.last is None or job.last.trajectories for job in jobs] == [()] * 3
 
 
 def test_tracks_and_predictions_come_over_the_bus(traffic: Traffic, known: Path) -> None:

@@ -129,6 +129,10 @@ def test_a_restarted_camera_is_left_out_of_what_the_others_verify(session: Sessi
     assert hub.state(22.0)[0] == "calibrated"
     assert hub.calibration is not None
     assert set(hub.calibration.cameras) == {"cam0", "cam2"}
+    found = hub.for_files()
+    assert found is not None
+    assert found[0].cameras.keys() == {"cam0", "cam1", "cam2"}, "in the files as it was"
+    assert hub.boot_ids["cam1"] == "before"
 
 
 def test_a_camera_that_is_not_heard_keeps_its_pose_over_two_restarts(
@@ -162,6 +166,63 @@ def test_a_camera_that_is_not_heard_keeps_its_pose_over_two_restarts(
     assert again.calibration is not None
     clock = again.calibration.cameras["cam1"].time_map
     assert abs(session.clock_error("cam1", again.calibration.reference, clock)) < 1e-3
+
+
+def restart(hub: LiveHub, camera: str) -> None:
+    """From here on the camera's agent is another process, whose clock has begun anew."""
+    handle = hub.handle
+
+    def changed(message: Message, *more: float) -> None:
+        if getattr(message, "camera", "") == camera:
+            message.boot_id = "another"  # type: ignore[attr-defined]
+            if isinstance(message, pb.Observation):
+                message.device_time_ns -= 5_000 * NANOSECONDS
+        handle(message, *more)
+
+    hub.handle = changed  # type: ignore[method-assign,assignment]
+
+
+def test_a_restarted_camera_keeps_its_pose_in_the_files_until_it_is_located_again(
+    session: Session, kept: Path, tmp_path: Path
+) -> None:
+    """Whoever copied calibration.toml meanwhile had one camera less; after another restart, fps was missing too."""
+    hub, file = LiveHub(SETTINGS), tmp_path / "calibration.toml"
+    play(hub, session, 0.0, 12.0)
+    assert hub.calibration is not None
+    before = hub.calibration.cameras["cam0"].pose.position
+    restart(hub, "cam0")
+    until = 12.0
+    while "cam0" in hub.calibration.cameras and until < 18.0:
+        play(hub, session, until, until + 1.0)
+        until += 1.0
+    assert set(hub.calibration.cameras) == {"cam1", "cam2"}
+    found = hub.for_files()
+    assert found is not None
+    assert ("cam0" in hub.calibration.refused, "cam0" in found[0].refused) == (True, False)
+    assert any("cam0: restarted" in warning for warning in found[0].warnings)
+    store = AnswerStore(tmp_path, copy=file)
+    store.keep(found[0], found[1], hub.boot_ids, hub.delays)
+    store.close()
+    write_last(hub, tmp_path / "last")
+    for written in (file, tmp_path / "last" / "calibration.toml"):
+        assert read_calibration(written)[1]["cam0"].pose.position == pytest.approx(before, abs=0.01)
+
+    again = restarted(tmp_path)
+    without(again, "cam0")
+    play(again, session, until, until + 4.0)
+    found = again.for_files()
+    assert found is not None
+    AnswerStore(tmp_path, copy=file)._write(found[0], found[1], {})
+    rig, cameras = read_calibration(file)
+    assert cameras["cam0"].pose.position == pytest.approx(before, abs=0.01)
+    assert (rig.cameras["cam0"].fps, found[1].cameras["cam0"].position) == (session.rig.cameras["cam0"].fps, None)
+
+    play(hub, session, until, 24.0)
+    found = hub.for_files()
+    assert found is not None
+    assert hub.boot_ids["cam0"] == "another"
+    assert found[0].cameras["cam0"] is hub.calibration.cameras["cam0"]
+    assert found[0].warnings == ()
 
 
 def test_a_camera_that_comes_back_goes_on_from_its_pose(session: Session, kept: Path) -> None:
@@ -274,7 +335,7 @@ def test_after_a_power_cut_the_last_answer_holds_on_new_clocks_if_it_is_configur
     """Every camera's clock has begun anew, and the hub's own was never set."""
     hub, last = LiveHub(SETTINGS), AnswerStore(kept).load(of_any_age=True)
     assert last is not None
-    calibration, boots, delays = last
+    calibration, boots, delays, _ = last
     hub_clock = 1e9 + 18.0 + 0.05
     shift = {"cam0": 500.0, "cam1": -300.0, "cam2": 40.0}
     before = {}

@@ -30,11 +30,12 @@ class CameraUnderTest:
         on_command: Callable[[OperatorCommand], bool] = lambda command: True,
         stream: VideoStream | None = None,
         stations: frozenset[int] = frozenset(),
+        system: int | None = None,
     ) -> None:
         ours, self.pipe = Pipe.pair()
         self.link = Link(
             None,
-            system=None,
+            system=system,
             component=100,
             allowed=("HEARTBEAT", "COMMAND_LONG", "COMMAND_INT"),
             transport=ours,
@@ -87,7 +88,7 @@ class CameraUnderTest:
         out = []
         for data, _ in self.pipe.receive():
             out += reader.parse_buffer(data) or []
-        assert all((m.get_srcSystem(), m.get_srcComponent()) == (1, 100) for m in out)
+        assert all((m.get_srcSystem(), m.get_srcComponent()) == (self.link.system, 100) for m in out)
         return out
 
     def status_message(self, kind: str) -> Any:
@@ -210,6 +211,18 @@ def test_a_command_int_that_names_no_camera_is_for_this_one() -> None:
         (ack,) = [one for one in under_test.send(message) if one.get_type() == "COMMAND_ACK"]
         assert ack.result == mavlink.MAV_RESULT_ACCEPTED
     assert len(chosen) == 2
+
+
+def test_a_camera_with_a_system_id_of_its_own_is_reached_by_it() -> None:
+    """It announced itself as system 7, and took commands only for system 1, the vehicle."""
+    orders: list[OperatorCommand] = []
+    under_test = CameraUnderTest(lambda command: not orders.append(command), system=7)
+    parameters = (0.4, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for system in (1, 7):
+        message = mavlink.MAVLink_command_long_message(system, 100, mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0, *parameters)
+        acknowledged = [m for m in under_test.send(message) if m.get_type() == "COMMAND_ACK"]
+        assert len(acknowledged) == (system == 7)
+    assert len(orders) == 1
 
 
 @pytest.mark.parametrize(

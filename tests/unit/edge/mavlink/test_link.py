@@ -102,16 +102,16 @@ def test_messages_are_accepted_only_after_an_autopilots_heartbeat_and_from_that_
     for kind in (mavlink.MAV_TYPE_ANTENNA_TRACKER, mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ADSB):
         other.send(heartbeat(mavlink.MAV_AUTOPILOT_GENERIC, kind))
     link.poll()
-    assert link.second_autopilot(time.monotonic_ns()) == ""
+    assert link.second_sender(time.monotonic_ns()) == ""
     other.send(heartbeat())
     assert link.poll() == []
     assert (link.vehicle, link.counters["refused.other_vehicle"]) == (1, 1)
-    assert link.second_autopilot(time.monotonic_ns()).startswith("system 2 is on this link too, and is not followed")
+    assert link.second_sender(time.monotonic_ns()).startswith("system 2 is on this link too, and is not followed")
     chosen, pipe = make_link(vehicle=1)
     for system in (1, 2):
         Sender(pipe, system).send(heartbeat())
     chosen.poll()
-    assert (chosen.vehicle, chosen.second_autopilot(time.monotonic_ns())) == (1, "")
+    assert (chosen.vehicle, chosen.second_sender(time.monotonic_ns())) == (1, "")
 
 
 def test_only_the_vehicles_own_signatures_are_counted() -> None:
@@ -261,6 +261,23 @@ def test_a_camera_uses_the_system_id_of_its_vehicle() -> None:
     ((data, _),) = pipe.receive()
     message = mavlink.MAVLink(None).parse_buffer(data)[0]
     assert (message.get_srcSystem(), message.get_srcComponent()) == (42, 100)
+
+
+def test_another_component_with_the_same_ids_is_named_and_an_echo_is_not() -> None:
+    """Two cameras of one vehicle: stations saw one, both took its commands, and nothing said so."""
+    link, pipe = make_link(system=None)
+    Sender(pipe).send(heartbeat())
+    link.poll()
+    link.send(heartbeat(autopilot=8))
+    ((own, _),) = pipe.receive()
+    pipe.send(own, None)
+    link.poll()
+    assert link.second_sender(time.monotonic_ns()) == ""
+    twin = Sender(pipe, component=100)
+    for _ in range(2):
+        twin.send(heartbeat(autopilot=8))
+    link.poll()
+    assert link.second_sender(time.monotonic_ns()).startswith("another component 100 of system 1 is on this link")
 
 
 def test_a_broken_link_is_reopened_with_increasing_pauses() -> None:
