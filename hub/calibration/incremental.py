@@ -29,7 +29,7 @@ from hub.calibration.acceptance import larger_residuals, misfits, network_failur
 from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, bic_prefers, deviances, final_adjustment
 from hub.calibration.pairs.moved_pair import LEAST_SIDE_S, PairDivision, find_division, time_map_between
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
-from hub.calibration.pipeline import calibrate
+from hub.calibration.pipeline import calibrate, heads_of_people
 from hub.calibration.resection.moved_cameras import Move, moved_camera, without_moved
 from hub.calibration.resection.scan import other_image, scan_resection
 from hub.calibration.result import assemble_calibration
@@ -88,16 +88,9 @@ def update_calibration(
     Raises Refused where fewer than two cameras can be placed.
     """
     if last is None or sum(name in last.cameras for name in observations.cameras) < 2:
-        found = calibrate(
-            rig,
-            observations,
-            clock_priors=clock_priors,
-            arrivals=None if full and len(rig.cameras) <= LARGE_NETWORK else arrivals,
-            online=True,
-            refine_lenses=refine_lenses,
-        )
-        found = with_step_stds(on_newest_side(found))
+        found = _from_scratch(rig, observations, full, clock_priors, arrivals, refine_lenses)
         return Update(found if last is None else _in_published_clock(found, last), {})
+    observations = heads_of_people(rig, observations)
     if last.reference in rig.cameras:
         rig = replace(rig, metadata={**rig.metadata, "reference": last.reference})
     if since := _since_a_move_of_two(rig, observations, last, full):
@@ -188,6 +181,29 @@ def update_calibration(
     kept = {name: camera for name, camera in last.cameras.items() if name not in found.cameras and name not in refuted}
     refused = {name: reason for name, reason in found.refused.items() if name not in kept}
     return Update(replace(found, cameras=found.cameras | kept, refused=refused), moved)
+
+
+def _from_scratch(
+    rig: Rig,
+    observations: Observations,
+    full: bool,
+    clock_priors: Mapping[str, ExternalClockPrior] | None,
+    arrivals: Mapping[str, ExternalClockPrior] | None,
+    refine_lenses: bool,
+) -> Calibration:
+    """The calibration of cameras of which nothing is known; of people whose feet it takes to begin, by their heads."""
+    found = calibrate(
+        rig,
+        observations,
+        clock_priors=clock_priors,
+        arrivals=None if full and len(rig.cameras) <= LARGE_NETWORK else arrivals,
+        online=True,
+        refine_lenses=refine_lenses,
+    )
+    found, heads = with_step_stds(on_newest_side(found)), heads_of_people(rig, observations)
+    if heads is observations or {table.label for table in found.trajectories} <= set(heads.labels):
+        return found
+    return update_calibration(rig, heads, found, search=False, full=False).calibration
 
 
 def _other_images(prepared: PreparedSession, reconstruction: Reconstruction, new: list[str]) -> dict[str, str]:

@@ -70,8 +70,7 @@ def calibrate(
     cameras can be placed.
     """
     report = progress or (lambda text, share: None)
-    if known is not None:
-        rig = with_known_intrinsics(rig, known)
+    rig = rig if known is None else with_known_intrinsics(rig, known)
     if rig.bodies and solver == "joint" and not online and _has_bodies(rig, observations):
         from hub.calibration.rigid_body.solve import calibrate_bodies
 
@@ -82,6 +81,19 @@ def calibrate(
             if max(len(body) for body in rig.bodies.values()) > _SMALL_BODY:
                 raise
             rig = replace(rig, bodies={}, scale_bars=rig.scale_bars + _diagonals(rig))
+    again = partial(
+        calibrate,
+        rig,
+        progress=progress,
+        thorough=thorough,
+        clock_priors=clock_priors,
+        arrivals=arrivals,
+        online=online,
+        refine_lenses=refine_lenses,
+    )
+    if solver == "joint" and known is None and (heads := heads_of_people(rig, observations)) is not observations:
+        with suppress(Refused):  # heads of people of one height lie in a plane, which places no camera
+            return again(heads)
     prepared = prepare(rig, observations)
     has_sizes = solver == "paper" and known is None and _have_sizes(prepared, observations)
     if has_sizes and prepared.shared_clock:
@@ -102,16 +114,6 @@ def calibrate(
             warnings=prepared.warnings + frame_rate_warnings(prepared, pairs),
         )
     may_move = thorough and solver == "joint" and known is None and not prepared.shared_clock
-    again = partial(
-        calibrate,
-        rig,
-        progress=progress,
-        thorough=thorough,
-        clock_priors=clock_priors,
-        arrivals=arrivals,
-        online=online,
-        refine_lenses=refine_lenses,
-    )
     of_two = solver == "joint" and known is None and not prepared.shared_clock and len(prepared.cameras) == 2
     try:
         if known is not None:
@@ -144,6 +146,17 @@ def calibrate(
         if not (moves := moves_of_two(prepared, likely, observations, online)):
             raise _with_pairs(refusal, prepared, pairs) from None
     return _from_one_side(moves, observations, again)
+
+
+def heads_of_people(rig: Rig, observations: Observations) -> Observations:
+    """The observations without the feet where the target is people and there are several, whose heads are enough.
+
+    A detected foot is ten times as inexact as a head, and for a whole step at a time, which passes for clocks and
+    stamps: of five simulated rigs with four people for 36 s it left one, with lags 25 ms off at stds of 9 to 11.
+    """
+    heads = {key: track for key, track in observations.tracks.items() if key[1].endswith("-head")}
+    several = rig.metadata.get("target") == "person" and len({label for _, label in heads}) > 1
+    return replace(observations, tracks=heads) if several and len(heads) < len(observations.tracks) else observations
 
 
 def _have_sizes(prepared: PreparedSession, observations: Observations) -> bool:

@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 from hub.clocks.change_detector import ClockChange
 from hub.clocks.external_prior import ArrivalPriors, ExternalClockPrior, ExternalClockPriors
 from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments, RateChanges
-from hub.tracking.calibration.people import PeopleTracklets
+from hub.tracking.calibration.people import PERSON, PeopleTracklets
 from hub.tracking.detections import tracked_kind
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
@@ -113,7 +113,8 @@ class ObservationStream:
         if of_marker:
             rig, observations = self.marker.build()
             return rig, self._with_rate_changes_corrected(observations)
-        rig = Rig({name: rig_camera_from_info(self._infos[name]) for name in sorted(self._infos)})
+        cameras = {name: rig_camera_from_info(self._infos[name]) for name in sorted(self._infos)}
+        rig = Rig(cameras, metadata={"target": PERSON})
         observations = self.people.observations()
         if not len(observations):
             raise Refused("the colours of the people are ambiguous, or no two cameras observed the same person")

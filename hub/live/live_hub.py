@@ -851,4 +851,4 @@ def merge_rigs(observed: Rig, own: Rig | None) -> Rig:
             cameras[name] = camera
     ordered = {name: cameras[name] for name in own.cameras if name in cameras}
     ordered |= {name: camera for name, camera in cameras.items() if name not in ordered}
-    return Rig(ordered, own.units, own.clock, own.distances, own.up, own.metadata, own.file)
+    return Rig(ordered, own.units, own.clock, own.distances, own.up, observed.metadata | own.metadata, own.file)

@@ -227,7 +227,8 @@ def self_calibrated(seed: int, people: int, seconds: float = 60.0, faults: Fault
         {
             c.name: RigCamera(c.name, (c.intrinsics.width, c.intrinsics.height), c.fps, c.intrinsics)
             for c in scene.cameras
-        }
+        },
+        metadata={"target": "person"},
     )
     begun = time.process_time()
     try:
