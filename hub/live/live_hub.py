@@ -280,8 +280,7 @@ class LiveHub:
         cameras = self.stream.marker.cameras
         if self.unverified:
             assert self._reloaded is not None
-            held, least = self._held, VERIFY_ROWS if self._has_marker() else _MIN_PEOPLE_S
-            enough = sum(held(name) >= least for name in self._reloaded.calibration.cameras) >= 2
+            enough = self._can_verify(self._reloaded.calibration)
             return "" if enough else "verifying the reloaded calibration"
         if len(cameras) < 2:
             return f"{len(cameras)} of at least 2 cameras heard of"
@@ -552,19 +551,19 @@ class LiveHub:
     def _check_known(self, now: float) -> None:
         """Have the given calibration tested by the present rows, every minute; the answer is for the status."""
         assert self.calibration is not None
-        rows = [self.stream.marker.rows(name) for name in self.calibration.cameras]
-        if now < self._next_check or not self._has_marker() or sum(count >= VERIFY_ROWS for count in rows) < 2:
+        if now < self._next_check or not self._can_verify(self.calibration):
             return
         self._next_check = now + _CHECK_EVERY_S
         try:
-            _, observations = self._build_session()
+            rig, observations = self._build_session()
         except (Refused, InputError):
             return
         assert self._rig is not None
         tracks = {key: one for key, one in observations.tracks.items() if key[0] in self.calibration.cameras}
         observations = replace(observations, tracks=tracks)
         self._jobs += 1
-        job = SolverJob(self._jobs, self._rig, observations, self.calibration, verify=True)
+        rig = replace(self._rig, metadata=rig.metadata)
+        job = SolverJob(self._jobs, rig, observations, self.calibration, verify=True)
         self._submitted, self._submitted_at, self._submitted_boots = job, now, {}
         self.solver.submit(job, now)
 
@@ -742,6 +741,11 @@ class LiveHub:
     def _has_marker(self) -> bool:
         """Whether to calibrate from markers: there are enough marker detections, or no people."""
         return self.stream.has_marker(self.settings.least_rows)
+
+    def _can_verify(self, calibration: Calibration) -> bool:
+        """Whether two cameras of a calibration have enough to test it by."""
+        least = VERIFY_ROWS if self._has_marker() else _MIN_PEOPLE_S
+        return sum(self._held(name) >= least for name in calibration.cameras) >= 2
 
     def _held(self, camera: str) -> float:
         """Of a camera, the detections of markers or the seconds of people that are held to calibrate from."""

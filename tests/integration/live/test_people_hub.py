@@ -22,6 +22,8 @@ from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
+from protocols.geometry import so3
+from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
@@ -178,6 +180,24 @@ def test_a_reloaded_answer_is_verified_by_people_where_there_is_no_marker(known:
     assert hub.calibration is not None
     assert hub.calibration.trajectories
     assert [job.last is None or job.last.trajectories for job in jobs] == [()] * 3
+
+
+@pytest.mark.parametrize(("turned", "state"), [(0.0, "calibrated"), (0.02, "degraded"), (0.14, "degraded")])
+def test_a_given_calibration_is_tested_by_people_where_there_is_no_marker(
+    known: Path, turned: float, state: str
+) -> None:
+    """A tripod that was kicked between two films was not noticed: the calibration was tested by markers alone."""
+    rig, cameras = read_calibration(known)
+    pose = cameras["cam1"].pose
+    moved = Pose(so3.exp(np.array([0.0, turned, 0.0])) @ pose.rotation, pose.position)
+    cameras["cam1"] = replace(cameras["cam1"], pose=moved, rms_px=0.2)
+    hub, traffic = LiveHub(known=KnownCalibration(rig, cameras)), film(SCENE, 24.0, 21)
+    for message in (*traffic.infos, *traffic.messages()):
+        hub.handle(message)
+    hub.tick(1.0)
+    found, reason = hub.state(1.0)
+    assert found == state, reason
+    assert ("cam1: " in reason and "was it moved?" in reason) == (turned > 0.0), reason
 
 
 def test_tracks_and_predictions_come_over_the_bus(traffic: Traffic, known: Path) -> None:
