@@ -13,6 +13,7 @@ import argparse
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,10 +86,14 @@ def simulated(
     turn: float = 0.0,
     shift: float = 0.0,
     lag: float = 0.0,
+    move: Callable[[np.random.Generator, int, float, float], Floats] = walk,
 ) -> Hall:
-    """The detections of a hall. turn [rad], shift [m]: std of the given poses' errors. lag [s]: of the last camera."""
+    """The detections of a hall. turn [rad], shift [m]: std of the given poses' errors. lag [s]: of the last camera.
+
+    move: paths as of `walk`.
+    """
     rng = np.random.default_rng(seed)
-    paths, tall = walk(rng, people, seconds, half), rng.normal(1.72, 0.08, people)
+    paths, tall = move(rng, people, seconds, half), rng.normal(1.72, 0.08, people)
     matrix = np.array([[FOCAL, 0.0, SIZE[0] / 2 - 0.5], [0.0, FOCAL, SIZE[1] / 2 - 0.5], [0.0, 0.0, 1.0]])
     lens = Intrinsics(*SIZE, matrix)
     frames = round(seconds * fps)

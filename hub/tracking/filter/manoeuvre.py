@@ -23,6 +23,10 @@ _MAX_LOG_ODDS = 50.0  # of a manoeuvre: after a pause of hours the odds exceed a
 _STEP_S = 0.5  # of one step: 120 a minute
 _POSTURE_STD = 0.2  # of the log of a person's height: who sits is a quarter lower than who stands
 _STANDING_M_S = 0.25  # a slow turn's speed; nobody sits down or stands up while walking
+_RUNNER_STD_M_S = 5.0  # of one component of the velocity of somebody who runs or cycles: a sprint is 10 m/s
+_RUNNERS_PER_S = 0.5  # rate, as of a manoeuvre: one in twenty at 10 frames a second
+_UNMEASURED = 0.5  # share of its prior variance above which a velocity is not known yet
+_SPEED_STD = np.array([model.speed_std_m_s for model in TARGET_MODELS])
 _MANOEUVRE_STD = np.array([model.manoeuvre_std_m_s for model in TARGET_MODELS])
 _MANOEUVRE_RATE = np.array([model.manoeuvres_per_s for model in TARGET_MODELS])
 
@@ -49,7 +53,8 @@ def manoeuvre_hypothesis(
     along which upright targets do not change their velocity. The time of the change is uniform over the time t, so the
     position variance grows by v t² / 3 and its covariance with the velocity by v t / 2, where v is the variance of the
     velocity change. An upright target may also have taken a step and stand again: a change that lasted for a part of a
-    step's duration, or of t where that is shorter, uniform as well, adds v / 3 times its square.
+    step's duration, or of t where that is shorter, uniform as well, adds v / 3 times its square. Of somebody whose
+    velocity is not measured yet the hypothesis is also that it is a runner's, ever since.
 
     posture: whether an upright target that stands may also have another height since, with its feet where they were.
     That is as large for short t: sitting down takes a second, and at many frames a second no two of them show it. Where
@@ -67,13 +72,25 @@ def manoeuvre_hypothesis(
     covariance[:, POSITION, VELOCITY] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, POSITION] += change * (time / 2.0)[:, None, None]
     covariance[:, VELOCITY, VELOCITY] += change
+    rate = _MANOEUVRE_RATE[targets.kind]
+    usual = _SPEED_STD[targets.kind] * units_of(targets, units_per_m)
+    variance = np.trace(targets.covariance[:, VELOCITY, VELOCITY], axis1=1, axis2=2) / 3.0
+    new = UPRIGHT[targets.kind] & (variance > _UNMEASURED * usual**2)
+    new &= _RUNNER_STD_M_S * np.abs(time) <= np.sqrt(3.0) * _MAX_SPREAD_M
+    if new.any():
+        fast = np.where(new, _RUNNER_STD_M_S * units_of(targets, units_per_m), 0.0)[:, None, None] ** 2 * axes
+        covariance[:, POSITION, POSITION] += fast * (time**2)[:, None, None]
+        covariance[:, POSITION, VELOCITY] += fast * time[:, None, None]
+        covariance[:, VELOCITY, POSITION] += fast * time[:, None, None]
+        covariance[:, VELOCITY, VELOCITY] += fast
+        rate = rate + np.where(new, _RUNNERS_PER_S, 0.0)
     if posture and up is not None:
         lower = np.zeros_like(targets.mean)
         lower[:, POSITION], lower[:, LOG_SIZE] = 0.5 * np.exp(targets.mean[:, LOG_SIZE, None]) * up, 1.0
         speed = np.linalg.norm(targets.mean[:, VELOCITY], axis=1) / units_of(targets, units_per_m)
         lower *= (UPRIGHT[targets.kind] * _POSTURE_STD / (1.0 + (speed / _STANDING_M_S) ** 2))[:, None]
         covariance += lower[:, :, None] * lower[:, None, :]
-    expected = np.minimum(_MANOEUVRE_RATE[targets.kind] * np.abs(time), _MAX_LOG_ODDS)
+    expected = np.minimum(rate * np.abs(time), _MAX_LOG_ODDS)
     return ManoeuvreHypothesis(covariance, np.expm1(expected))
 
 
