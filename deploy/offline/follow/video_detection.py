@@ -86,7 +86,8 @@ def _checked_videos(videos: Sequence[VideoFile], known: GivenCalibration) -> tup
     camera or of another picture size than its lens, and where none can be opened."""
     from edge.devices.playback.video_reader import VideoReader
 
-    opened, warnings = [], []
+    opened: list[VideoFile] = []
+    warnings: list[str] = []
     for video in videos:
         if video.camera not in known.names:
             what = f"camera {video.camera!r} is not in the calibration ({', '.join(known.names)})"
