@@ -20,9 +20,10 @@ _GAIN = 0.03
 _PROBABILITY = (0.1, 0.98)  # limits of the estimate: neither certain nor impossible
 _CLUTTER = (0.02, 50.0)  # limits, false detections a frame
 _NOISE = (0.5, 16.0)  # limits, of the stated variance
-_PERSON, _MARKER = KIND_INDEX["person"], KIND_INDEX["marker"]
+_PERSON = KIND_INDEX["person"]
 _OTHER_OBJECTS = 1e-3
-"""Expected detections of markers that are not tracked: others are rare, so that even a poor fit is the target."""
+"""Expected detections of markers and vehicles that are not tracked: others are rare, so that even a poor fit is the
+target."""
 _UNSEEN_PROBABILITY = 0.02
 """Of detecting a target outside the picture, by the uncertainty of its position."""
 
@@ -45,7 +46,7 @@ def detection_probability(statistics: DetectionStatistics, visible: Floats, occl
 
 def false_detections(statistics: DetectionStatistics, kind: Ints) -> Floats:
     """Expected false detections (n,) that may be taken for targets of each kind."""
-    return np.where(kind != _MARKER, statistics.clutter, np.minimum(statistics.clutter, _OTHER_OBJECTS))
+    return np.where(kind == _PERSON, statistics.clutter, np.minimum(statistics.clutter, _OTHER_OBJECTS))
 
 
 def independent_fraction(interval_s: float) -> float:
