@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,6 +11,7 @@ import numpy as np
 from hub.tracking.association.initiation import LengthScale
 from hub.tracking.calibration.vertical import VerticalEstimator
 from hub.tracking.detections import FrameDetections, TrackingCamera, frame_detections
+from hub.tracking.filter.detection_model import CORRELATION_S
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import MultiTargetState, Targets
@@ -239,6 +240,13 @@ def _sampled(
         across = np.trace(spread, axis1=1, axis2=2) - (0.0 if up is None else np.einsum("i,nij,j->n", up, spread, up))
         std = np.sqrt(across / (3.0 if up is None else 2.0))
         unseen = np.abs(seen[_nearest(seen, wanted)] - wanted)
+        if not model.upright:  # without a floor one camera alone gives a direction: the place is a guess
+            by_camera = Counter(camera for camera, _, _ in detections[row])
+            few = by_camera.most_common(2)[-1][1] * interval_ns < CORRELATION_S * NANOSECONDS
+            placed = (std < size) & (len(by_camera) > 1 and not few)
+            wanted, position, std, size, unseen = (one[placed] for one in (wanted, position, std, size, unseen))
+            if not len(wanted):
+                continue
         out.append(
             (seen[0], model.kind, wanted / NANOSECONDS, position, std, size, unseen <= coasting_ns, detections[row])
         )

@@ -130,8 +130,6 @@ def detect(
     check_file(out, "a CSV file", video, marker, rig)
     if overlay is not None:
         check_file(overlay, "a video", video, out, option="--overlay")
-        if not overlay.parent.is_dir():
-            raise InputError("cannot be written", file=overlay, remedy="give --overlay a file in a folder that exists")
     if teach != (target is not None):
         remedy = "give --teach --target x,y,w,h: the box of the marker in frame --start"
         raise InputError("--teach and --target go together", remedy=remedy)

@@ -32,8 +32,8 @@ def follow(
     """Follow people or vehicles through all cameras of a calibrated rig, offline.
 
     Writes tracks.csv (time,id,kind,state,x,y,z,height,std), report.html and result.json to --out. Times are on the
-    calibration's reference clock, places in its world and units; x, y, z is the foot point. An id is one person for as
-    long as the data allow. Exit status 3 if there is nobody to follow.
+    calibration's reference clock, places in its world and units; x, y, z is the foot point; of vehicles, the
+    middle. An id is one person for as long as the data allow. Exit status 3 if there is nobody to follow.
 
     Videos are named after their cameras. People or vehicles are first detected in each, in several processes; the
     detections are kept in --out as detections.mcap, which can be followed or replayed again.

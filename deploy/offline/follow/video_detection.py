@@ -64,7 +64,8 @@ def detect_videos(
     of moving people or vehicles. Returns the videos by camera, and warnings. Raises InputError.
     """
     videos, warnings = list_videos(folder)
-    _check_videos(videos, known)
+    videos, unreadable = _checked_videos(videos, known)
+    warnings += unreadable
     if detector is not None:
         from edge.detectors.plugins import load_detector
 
@@ -80,19 +81,30 @@ def detect_videos(
     return {video.camera: video.path for video in videos}, tuple(warnings)
 
 
-def _check_videos(videos: Sequence[VideoFile], known: GivenCalibration) -> None:
-    """Raise InputError for a video of an unknown camera or of another picture size than its lens."""
+def _checked_videos(videos: Sequence[VideoFile], known: GivenCalibration) -> tuple[list[VideoFile], list[str]]:
+    """The videos that can be opened, and a warning for each other one. Raises InputError for a video of an unknown
+    camera or of another picture size than its lens, and where none can be opened."""
     from edge.devices.playback.video_reader import VideoReader
 
+    opened: list[VideoFile] = []
+    warnings: list[str] = []
     for video in videos:
         if video.camera not in known.names:
             what = f"camera {video.camera!r} is not in the calibration ({', '.join(known.names)})"
             raise InputError(what, file=video.path, remedy="name each video after its camera, or remove this one")
-        size, lens = VideoReader(video.path).info.size, known.sizes.get(video.camera)
+        try:
+            size, lens = VideoReader(video.path).info.size, known.sizes.get(video.camera)
+        except InputError as error:
+            if not opened and video is videos[-1]:
+                raise
+            warnings.append(f"{video.path.name}: {error.what}; left out")
+            continue
+        opened.append(video)
         if lens is not None and size != lens:
             what = f"this video is {size[0]}x{size[1]}, the calibration of {video.camera} is for {lens[0]}x{lens[1]}"
             turned = "turn it: a copy may have lost its rotation" if size == lens[::-1] else ""
             raise InputError(what, file=video.path, remedy=turned or "calibrate at this picture size")
+    return opened, warnings
 
 
 def _run(jobs: list[_Job], progress: Progress) -> list[_Detected]:

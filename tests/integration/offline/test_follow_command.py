@@ -122,9 +122,12 @@ def test_videos_of_nobody_are_a_refusal_and_unknown_videos_bad_input(
 ) -> None:
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # without processes, whose start takes longer than these videos
     grey = [np.full((SIZE[1], SIZE[0], 3), 90 + index, np.uint8) for index in range(3)]
-    write_video(tmp_path / "left.mp4", grey, [0.0, 0.2, 0.4])
+    (tmp_path / "right.mp4").write_bytes(b"no video")
     known = ["--calibration", str(session / "calibration.toml"), "--out", str(tmp_path / "out")]
+    assert "right.mp4: " in refused(["follow", str(tmp_path), *known], 2, capsys)
+    write_video(tmp_path / "left.mp4", grey, [0.0, 0.2, 0.4])  # the other is left out
     assert "no person in any frame" in refused(["follow", str(tmp_path), *known], 3, capsys)
+    (tmp_path / "right.mp4").unlink()
     (seen,) = {
         message.topic.name for message in LogReader(tmp_path / "out" / "detections.mcap").messages([OBSERVATION])
     }
@@ -169,4 +172,7 @@ def test_bad_input_is_one_line_and_status_2(
     assert "--crops needs pictures" in refused(["follow", str(session), *known, "--crops", str(tmp_path)], 2, capsys)
     assert "--area goes with --truth" in refused(["follow", str(session), *known, "--area", "-1,1,-1,1"], 2, capsys)
     assert "does not exist" in refused(["follow", str(tmp_path / "nothing"), *known], 2, capsys)
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n\0")
+    given = ["--observations", str(tmp_path / "a.mcap")]
+    assert "this is an MCAP log, not text" in refused(["follow", str(session), *known, *given], 2, capsys)
     assert not (tmp_path / "out").exists()

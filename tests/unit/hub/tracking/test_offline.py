@@ -444,3 +444,43 @@ def test_cameras_at_different_heights_tell_level_and_typical_height() -> None:
     for foot in standing:
         floor = floor.with_feet(foot[None])
     assert np.abs(floor.heights(standing)[0] - standing[:, 2]).max() < 0.04
+
+
+def test_vehicles_where_different_ones_are_seen_in_one_place() -> None:
+    """On a street rays of different cars cross above it: the tracks of these crossings, and of one camera alone."""
+    rng = np.random.default_rng(5)
+    lane, begin = np.array([-5.0, -2.0, 2.0, 5.0] * 2), np.array([-60.0, -52.0, 60.0, 66.0, -88.0, -80.0, 90.0, 97.0])
+    velocity = np.where(lane < 0.0, 1.0, -1.0) * rng.uniform(11.0, 15.0, len(lane))
+
+    def cars(time: float) -> Floats:
+        return np.column_stack([begin + velocity * time, lane, np.full(len(lane), 0.75)])
+
+    messages, cameras = [], {}
+    for index in range(4):
+        name, angle = f"cam{index}", 0.5 * np.pi * index + 0.4
+        pose = look_at_pose(np.array([35.0 * np.cos(angle), 21.0 * np.sin(angle), 7.0 + 2.0 * (index % 2)]), 0.5 * UP)
+        cameras[name] = CameraCalibration(name, LENS, pose, TimeMap(1.0, 0.0), 1e-3, np.zeros(3), 1.0)
+        for frame in range(100):
+            time = frame / 12.5
+            message = pb.Observation(
+                schema_version=1, camera=name, boot_id="b", sequence=frame, frame=frame,
+                device_time_ns=round(time * NANOSECONDS),
+            )  # fmt: skip
+            seen = pose.camera_from_world(cars(time) + rng.normal(0.0, 0.1, (len(lane), 3)))
+            pixels = LENS.project(seen) + rng.normal(0.0, 1.5, (len(lane), 2))
+            inside = (seen[:, 2] > 1.0) & (pixels > 0.0).all(axis=1) & (pixels < [LENS.width, LENS.height]).all(axis=1)
+            inside &= rng.random(len(lane)) > 0.1
+            places = [*pixels[inside].tolist()]
+            places += [(rng.uniform(0.0, 1280.0), rng.uniform(200.0, 700.0)) for _ in range(int(rng.poisson(0.3)))]
+            for u, v in places:
+                message.detections.add(u=u, v=v, kind="vehicle", score=1.0)
+            messages.append(message)
+    calibration = Calibration(cameras=cameras, reference="cam0", scale="metric", units="m", solver="given", version="")
+    times = [round(frame / 12.5 * NANOSECONDS) for frame in range(100)]
+    result = follow(messages, calibration, times, up=UP)
+    rows = [(time, place) for track in result.tracks for time, place in zip(track.times, track.position, strict=True)]
+    off = np.array([np.linalg.norm(cars(time) - place, axis=1).min() for time, place in rows])
+    assert len(rows) > 300
+    assert (off > 3.0).mean() < 0.1
+    assert len(result.tracks) <= len(lane)
+    assert all(track.std.max() < 1.8 for track in result.tracks)
