@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -206,11 +206,13 @@ def _sampled(
     out = []
     detections: list[list[tuple[str, int, int]]] = [[] for _ in range(count)]
     seen_ns: list[list[int]] = [[] for _ in range(count)]
+    lasted: list[dict[str, float]] = [defaultdict(float) for _ in range(count)]  # seconds that each camera saw it
     for recorded in smoother.scans:
         for one in recorded.frames:
             for row, j in zip(one.ids.tolist(), one.column.tolist(), strict=True):
                 detections[row].append((one.frame.camera.name, one.frame.sequence, j))
                 seen_ns[row].append(one.frame.reference_ns)
+                lasted[row][one.frame.camera.name] += one.statistics.interval_s
     own: list[list[tuple[int, int]]] = [[] for _ in range(count)]
     for index, scan in enumerate(scans):
         for place, row in enumerate(scan.row.tolist()):
@@ -241,9 +243,7 @@ def _sampled(
         std = np.sqrt(across / (3.0 if up is None else 2.0))
         unseen = np.abs(seen[_nearest(seen, wanted)] - wanted)
         if not model.upright:  # without a floor one camera alone gives a direction: the place is a guess
-            by_camera = Counter(camera for camera, _, _ in detections[row])
-            few = by_camera.most_common(2)[-1][1] * interval_ns < CORRELATION_S * NANOSECONDS
-            placed = (std < size) & (len(by_camera) > 1 and not few)
+            placed = (std < size) & (sorted([0.0, *lasted[row].values()])[-2] >= CORRELATION_S)
             wanted, position, std, size, unseen = (one[placed] for one in (wanted, position, std, size, unseen))
             if not len(wanted):
                 continue

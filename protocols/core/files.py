@@ -58,7 +58,7 @@ def read_text(file: Path, what: str = "file", most: int = MAX_TEXT) -> str:
         return re.sub("\r\n?", "\n", data.decode("utf-8-sig"))
     except ValueError:
         if data.startswith(b"\x89MCAP"):
-            remedy = f"make a session of it, `syncline export {file} --out FOLDER`, or give it as the session"
+            remedy = f"give a text file; `syncline export {file} --out FOLDER` writes what the log holds as such"
             raise InputError("this is an MCAP log, not text", file=file, remedy=remedy) from None
         raise InputError("cannot be read: it is not UTF-8 text", file=file, remedy="save it as UTF-8 text") from None
 

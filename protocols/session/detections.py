@@ -6,7 +6,7 @@ these rows, synchronisation and calibration read ``observations.Observations``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,7 +71,7 @@ def read_detections(file: Path, sizes: Mapping[str, tuple[int, int]]) -> Detecti
     rows.table.refuse(invalid, lambda row: "cov_uu, cov_uv, cov_vv are no covariance")
     head, foot = _together(rows, ("head_u", "head_v")), _together(rows, ("foot_u", "foot_v"))
     remedy = "swap them, or turn the images upright"
-    rows.table.refuse(swapped_ends(head, foot), lambda row: "the head is not above the foot", remedy)
+    rows.table.refuse(swapped_ends(head, foot, rows.camera), lambda row: "the head is not above the foot", remedy)
     box = _together(rows, ("box_x", "box_y", "box_w", "box_h"))
     rows.table.refuse((box[:, 2:] <= 0.0).any(axis=1), lambda row: f"a box of {box[row, 2]:g} x {box[row, 3]:g} px")
     limit = np.array([sizes[name] for name in rows.camera], dtype=np.float64).reshape(-1, 2)
@@ -94,8 +94,8 @@ def read_detections(file: Path, sizes: Mapping[str, tuple[int, int]]) -> Detecti
     )
 
 
-def swapped_ends(head: Floats, foot: Floats) -> Bools:
-    """Which heads (n, 2) [px] are below their feet, where nearly all of them are; otherwise none.
+def swapped_ends(head: Floats, foot: Floats, camera: Sequence[str]) -> Bools:
+    """Which heads (n, 2) [px] are below their feet, in cameras (n,) in which nearly all are; in others none.
 
     From the ceiling, heads point away from below the camera, to all sides. In a camera on its side they are beside the
     feet.
@@ -103,7 +103,9 @@ def swapped_ends(head: Floats, foot: Floats) -> Bools:
     across, down = (foot - head).T
     along = np.abs(across) <= np.abs(down)
     below = along & (down <= 0.0)
-    return np.asarray(below & (below.sum() > _SWAPPED * along.sum()))
+    _, index = np.unique(np.asarray(camera), return_inverse=True)
+    share = np.bincount(index, below) > _SWAPPED * np.bincount(index, along)
+    return np.asarray(below & share[index])
 
 
 def _together(rows: ObservationRows, names: tuple[str, ...], limit: float = 1e6) -> Floats:

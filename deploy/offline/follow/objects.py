@@ -192,11 +192,11 @@ def _check_pairs(rows: DetectionRows, file: Path) -> None:
         if name and end in ("head", "foot"):
             ends.setdefault((rows.camera[row], float(rows.time[row]), name), {}).setdefault(end, row)
     names = [name for (_, _, name), one in ends.items() if len(one) == 2]
-    pairs = np.array([[one["head"], one["foot"]] for one in ends.values() if len(one) == 2], dtype=np.int64)
-    head, foot = rows.pixels[pairs.reshape(-1, 2).T]
-    for index in np.flatnonzero(swapped_ends(head, foot))[:1].tolist():
+    pairs = [[one["head"], one["foot"]] for one in ends.values() if len(one) == 2]
+    head, foot = rows.pixels[np.array(pairs, dtype=np.int64).reshape(-1, 2).T]
+    for index in np.flatnonzero(swapped_ends(head, foot, [rows.camera[row] for row, _ in pairs]))[:1].tolist():
         what = f"{names[index]}: the head is not above the foot"
-        line = max(rows.line[row] for row in pairs[index].tolist())
+        line = max(rows.line[row] for row in pairs[index])
         raise InputError(what, file=file, line=line, remedy="swap the labels")
 
 

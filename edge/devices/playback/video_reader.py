@@ -163,11 +163,12 @@ class VideoReader:
             return VideoInfo(upright_size(first), rate, count, _stated_end(container))
 
     def _read_file(self) -> Iterator[VideoFrame]:
-        last, frame = -math.inf, 0
+        last, stamp, frame = -math.inf, -math.inf, 0
         for time, size, image in self._pyav_frames() if has_pyav() else self._opencv_frames():
             if size != self.info.size:
                 self.resized += 1
                 continue
+            stamp = max(stamp, -math.inf if time is None else time)
             if self._given_fps:
                 time = frame / self._given_fps
             elif time is None or not last < time < math.inf:
@@ -176,9 +177,9 @@ class VideoReader:
             last = time
             yield VideoFrame(frame, time, image)
             frame += 1
-        if not self._given_fps and not self.resized and last + _CUT_S < self.info.end:
+        if math.isfinite(stamp) and not self.resized and stamp + _CUT_S < self.info.end:
             says = f"its container says {self.info.end:.1f} s"
-            self.cut = f"it ends at {last:.1f} s, {says}: the file seems to be cut off"
+            self.cut = f"it ends at {stamp:.1f} s, {says}: the file seems to be cut off"
 
     def _pyav_frames(self) -> Iterator[_Decoded]:
         with self._opened() as container:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -103,7 +103,7 @@ class Link:
         self.vehicle = vehicle
         self.last_received_ns = 0
         self.counters: Counter[str] = Counter()
-        self._beat_sequence = -1
+        self._beat_sequences: deque[int] = deque(maxlen=16)  # an echo over a satellite takes seconds
         self._outbox = Outbox(capacity(url), self.counters)
         self.problem = ""
 
@@ -197,7 +197,7 @@ class Link:
             if self._as_vehicle and self.vehicle is not None:
                 self._codec.srcSystem = self.vehicle
             if message.get_type() == "HEARTBEAT":
-                self._beat_sequence = self._codec.seq
+                self._beat_sequences.append(self._codec.seq)
             data = bytes(message.pack(self._codec))
             try:
                 if not self._transport.send(data, self._reply_address or self._address):
@@ -263,7 +263,7 @@ class Link:
             if self._signing is None and frame[0] == V2 and frame[2] & SIGNED:
                 self.counters["signed"] += 1  # which cannot be verified
         own_ids = (system, component) == (self.system, self._codec.srcComponent)
-        if kind == "HEARTBEAT" and own_ids and message.get_seq() != self._beat_sequence:  # no echo
+        if kind == "HEARTBEAT" and own_ids and message.get_seq() not in self._beat_sequences:  # no echo
             text = f"another component {component} of system {system} is on this link: stations reach both as one"
             self._second = (now, f"{text}; set system in [mavlink], or the other one's component id")
         self.counters["received"] += 1

@@ -76,6 +76,7 @@ def manoeuvre_hypothesis(
     usual = _SPEED_STD[targets.kind] * units_of(targets, units_per_m)
     variance = np.trace(targets.covariance[:, VELOCITY, VELOCITY], axis1=1, axis2=2) / 3.0
     new = UPRIGHT[targets.kind] & (variance > _UNMEASURED * usual**2)
+    # Beyond a quarter of a second a runner could be anywhere.
     new &= _RUNNER_STD_M_S * np.abs(time) <= np.sqrt(3.0) * _MAX_SPREAD_M
     if new.any():
         fast = np.where(new, _RUNNER_STD_M_S * units_of(targets, units_per_m), 0.0)[:, None, None] ** 2 * axes

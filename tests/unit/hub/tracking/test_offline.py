@@ -484,3 +484,23 @@ def test_vehicles_where_different_ones_are_seen_in_one_place() -> None:
     assert (off > 3.0).mean() < 0.1
     assert len(result.tracks) <= len(lane)
     assert all(track.std.max() < 1.8 for track in result.tracks)
+
+
+def test_a_vehicle_before_cameras_of_different_rates() -> None:
+    """Half a second of each camera counts, not half a second of the fastest one's frames."""
+    messages, cameras = [], {}
+    for index, fps in enumerate((30, 5)):
+        pose = look_at_pose(np.array([-8.0 + 16.0 * index, -20.0, 6.0]), 0.5 * UP)
+        cameras[f"cam{index}"] = CameraCalibration(f"cam{index}", LENS, pose, TimeMap(1.0, 0.0), 1e-3, np.zeros(3), 1.0)
+        for frame in range(round(2.5 * fps)):
+            message = pb.Observation(
+                schema_version=1, camera=f"cam{index}", boot_id="b", sequence=frame, frame=frame,
+                device_time_ns=round(frame / fps * NANOSECONDS),
+            )  # fmt: skip
+            at = np.array([[-5.0 + 4.0 * frame / fps, 0.0, 0.75]])
+            u, v = LENS.project(pose.camera_from_world(at))[0].tolist()
+            message.detections.add(u=u, v=v, kind="vehicle", score=1.0)
+            messages.append(message)
+    calibration = Calibration(cameras=cameras, reference="cam0", scale="metric", units="m", solver="given", version="")
+    result = follow(messages, calibration, [round(frame / 30 * NANOSECONDS) for frame in range(75)], up=UP)
+    assert [len(track.times) > 50 for track in result.tracks] == [True]

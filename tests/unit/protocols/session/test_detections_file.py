@@ -78,6 +78,13 @@ def test_below_a_ceiling_camera_some_heads_are_below_their_feet(tmp_path: Path) 
     assert len(read(tmp_path, PERSON, ",".join(away.values()))) == 2
 
 
+def test_one_swapped_camera_among_others_is_named(tmp_path: Path) -> None:
+    away = dict(zip(HEADER.split(","), PERSON.split(","), strict=True)) | {"head_v": "200", "camera": "b"}
+    with pytest.raises(InputError, match="the head is not above the foot") as caught:
+        read(tmp_path, *[PERSON] * 30, *[",".join(away.values())] * 2)
+    assert caught.value.line == 32
+
+
 def test_a_camera_on_its_side_has_its_heads_beside_the_feet(tmp_path: Path) -> None:
     cells = dict(zip(HEADER.split(","), PERSON.split(","), strict=True))
     cells |= {"head_u": "40", "head_v": "91", "foot_u": "140", "foot_v": "90"}
