@@ -376,7 +376,7 @@ def test_another_vehicle_and_a_gimbal_that_is_not_used_are_named() -> None:
     check(vehicle, "warn", "set vehicle")
     check(gimbal, "warn", 'mount = "gimbal"')
     assert list(autopilot.unused(autopilot.Heard(gimbal=True), 1, gimbal=True)) == []
-    reports = {"report": lambda _: "10.0.0.9:5000 sends as well", "second_autopilot": lambda _: ""}
+    reports = {"report": lambda _: "10.0.0.9:5000 sends as well", "second_sender": lambda _: ""}
     link = SimpleNamespace(counters=Counter(), **reports)
     heard = autopilot.listen(link, None, gimbal=False, rate_hz=30.0, seconds=0.0)
     assert list(autopilot.unused(heard, 1, gimbal=False)) == []
