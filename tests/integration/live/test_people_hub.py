@@ -16,7 +16,7 @@ from deploy.simulation.session import camera_tables
 from edge import scenes
 from hub.live.agent import run_hub, status_message
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings, merge_rigs
-from hub.live.solver import SolverJob
+from hub.live.solver import SolverJob, _unlike_others
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
@@ -206,6 +206,16 @@ def test_people_who_walk_from_one_view_to_the_next_contradict_no_calibration(kno
     assert (
         reason == ("" if given else "the calibration was reloaded and is not verified yet; ") + "4 cameras calibrated"
     )
+
+
+def test_a_camera_with_a_finer_image_was_not_moved(known: Path) -> None:
+    cameras = read_calibration(known)[1]
+    lens = cameras["cam3"].intrinsics
+    finer = replace(lens, matrix=lens.matrix * np.array([[3.0], [3.0], [1.0]]))
+    cameras["cam3"] = replace(cameras["cam3"], intrinsics=finer)
+    sigmas = dict.fromkeys(cameras, 1.0)
+    assert _unlike_others({**sigmas, "cam3": 3.0}, cameras) == ()
+    assert [text[:4] for text in _unlike_others({**sigmas, "cam2": 3.0}, cameras)] == ["cam2"]
 
 
 def test_what_is_seen_is_the_target_whatever_the_hubs_own_file_says() -> None:
