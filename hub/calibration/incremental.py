@@ -12,6 +12,7 @@ A camera is tied while its rows fit the trajectory that the others give. The old
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -203,7 +204,9 @@ def _from_scratch(
     found, heads = with_step_stds(on_newest_side(found)), heads_of_people(rig, observations)
     if heads is observations or {table.label for table in found.trajectories} <= set(heads.labels):
         return found
-    return update_calibration(rig, heads, found, search=False, full=False).calibration
+    with suppress(Refused):
+        return update_calibration(rig, heads, found, search=False, full=False).calibration
+    return found
 
 
 def _other_images(prepared: PreparedSession, reconstruction: Reconstruction, new: list[str]) -> dict[str, str]:

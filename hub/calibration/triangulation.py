@@ -71,12 +71,14 @@ def _triangulate(
     lenses = {name: replace(rig.cameras[name], intrinsics=camera.intrinsics) for name, camera in known.items()}
     prepared = prepare(replace(rig, cameras=lenses), observations)
     apart = _unshared(prepared, known)
+    # People walk from one camera's view to the next's, in which nobody was before.
+    set_anew = {} if rig.metadata.get("target") == "person" else apart
     unused = dict(prepared.refused) | apart
     names = [name for name in prepared.cameras if name not in unused]
     while True:
         if len(names) < 2:
             refusal = Refused(_too_few_cameras(names, unused), unused)
-            refusal.permanent = bool(apart)
+            refusal.permanent = bool(set_anew)
             raise refusal
         if coincide(*(known[name].pose.position for name in names)):
             raise Refused(f"the cameras {', '.join(names)} are in one place: their rays meet nowhere else", unused)
@@ -110,7 +112,7 @@ def _triangulate(
         unused,
         tuple(label for label in observations.labels if label not in triangulated),
         tuple(warnings),
-        tuple(name for name in unused if name not in prepared.refused),
+        tuple(name for name in unused if name in set_anew or name not in {**prepared.refused, **apart}),
     )
 
 

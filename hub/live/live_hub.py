@@ -214,6 +214,7 @@ class LiveHub:
             self.stream.release(name)
             self.links.last_frame.pop(name, None)
             self._restarted.pop(name, None)
+            self._rig_cameras.pop(name, None)
         if self.calibration is not None:
             kept = {name: one for name, one in self.calibration.cameras.items() if name not in cameras}
             self.calibration = replace(self.calibration, cameras=kept) if len(kept) > 1 else None
@@ -501,11 +502,7 @@ class LiveHub:
             self.refusal = refusal
             return []
         except Exception as error:  # noqa: BLE001 - whatever is wrong with the rows must not stop the hub
-            self.counters["bad_sessions"] += 1
-            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-            self.refusal = Refused(f"{kind}{error}")
-            if self.calibration is not None:
-                self.solver_failure = self.refusal.reason
+            self.refusal = self._bad_session(error)
             return []
         self._schedule.readmit(now)
         left_out = self._schedule.left_out
@@ -548,6 +545,15 @@ class LiveHub:
         ranges = [one for one in self.stream.marker.ranges() if one[0] in rig.cameras] if self._has_marker() else []
         return self._hand_over(job, boots, ranges, now)
 
+    def _bad_session(self, error: Exception) -> Refused:
+        """Count an error in the rows; as a refusal."""
+        self.counters["bad_sessions"] += 1
+        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        refusal = Refused(f"{kind}{error}")
+        if self.calibration is not None:
+            self.solver_failure = refusal.reason
+        return refusal
+
     def _check_known(self, now: float) -> None:
         """Have the given calibration tested by the present rows, every minute; the answer is for the status."""
         assert self.calibration is not None
@@ -556,8 +562,12 @@ class LiveHub:
         self._next_check = now + _CHECK_EVERY_S
         try:
             rig, observations = self._build_session()
-        except (Refused, InputError):
+        except Refused:
             return
+        except Exception as error:  # noqa: BLE001 - whatever is wrong with the rows must not stop the hub
+            self._bad_session(error)
+            return
+        self.solver_failure = ""
         assert self._rig is not None
         tracks = {key: one for key, one in observations.tracks.items() if key[0] in self.calibration.cameras}
         observations = replace(observations, tracks=tracks)
@@ -579,6 +589,8 @@ class LiveHub:
         self, job: SolverJob, boots: dict[str, str], ranges: list[tuple[str, str, int, int, int]], now: float
     ) -> list[Message]:
         self._jobs = job.number
+        if self._reloaded is not None and self._reloaded.since is None:
+            self._reloaded.since = now
         if self.calibration is None:
             self.session = job.rig, job.observations
         self._submitted, self._submitted_at, self._submitted_boots = job, now, boots
@@ -623,7 +635,9 @@ class LiveHub:
         event = solver_event(job, "applied", [], answer)
         if answer.calibration is None:
             self.counters["refused"] += 1
-            if job.verify and (answer.permanent or self._reloaded is None or self._reloaded.has_failed(now)):
+            # Of people too little may be seen for hours: only rows that contradict it end it.
+            too_late = self._reloaded is None or (self._has_marker() and self._reloaded.has_failed(now))
+            if job.verify and (answer.permanent or too_late):
                 self._reloaded, self.calibration = None, None  # what was reloaded does not hold any more
             if self.calibration is not None:
                 # An answer that holds is not given up because new rows say little, but that they contradict it is told.
@@ -744,12 +758,11 @@ class LiveHub:
 
     def _can_verify(self, calibration: Calibration) -> bool:
         """Whether two cameras of a calibration have enough to test it by."""
-        least = VERIFY_ROWS if self._has_marker() else _MIN_PEOPLE_S
-        return sum(self._held(name) >= least for name in calibration.cameras) >= 2
-
-    def _held(self, camera: str) -> float:
-        """Of a camera, the detections of markers or the seconds of people that are held to calibrate from."""
-        return self.stream.marker.rows(camera) if self._has_marker() else self.stream.people.seconds(camera)
+        if self._has_marker():
+            return sum(self.stream.marker.rows(name) >= VERIFY_ROWS for name in calibration.cameras) >= 2
+        # People who walk from one camera's view to the next's say nothing of where the cameras are.
+        clocks = {name: one.time_map for name, one in calibration.cameras.items()}
+        return sum(held >= _MIN_PEOPLE_S for held in self.stream.people.shared_seconds(clocks).values()) >= 2
 
     def _build_session(self) -> tuple[Rig, Observations]:
         """The rig and the observations: of the marker or, if there is none, of people."""
@@ -855,4 +868,7 @@ def merge_rigs(observed: Rig, own: Rig | None) -> Rig:
             cameras[name] = camera
     ordered = {name: cameras[name] for name in own.cameras if name in cameras}
     ordered |= {name: camera for name, camera in cameras.items() if name not in ordered}
-    return Rig(ordered, own.units, own.clock, own.distances, own.up, observed.metadata | own.metadata, own.file)
+    metadata = observed.metadata | own.metadata
+    if "target" in observed.metadata:  # what is seen is what the rows are of
+        metadata["target"] = observed.metadata["target"]
+    return Rig(ordered, own.units, own.clock, own.distances, own.up, metadata, own.file)

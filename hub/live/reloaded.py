@@ -25,7 +25,7 @@ class ReloadedCalibration:
     """boots, delays: of its cameras then. arrival: the hub's clock at those delays [s], None = unknown.
 
     Cameras that were restarted since, or whose clock was set, are left out; where ``arrival`` is given, they come to
-    their new clocks by the delays then and now. since: when it was published [s].
+    their new clocks by the delays then and now. since: when it was first tested [s].
     """
 
     calibration: Calibration
@@ -75,7 +75,6 @@ class ReloadedCalibration:
             self.calibration = replace(last, cameras=kept | unheard)
         if len(kept) < 2:
             return None  # not heard of yet, a backlog, or clocks that it does not know
-        self.since = now
         return replace(self.calibration, cameras=kept | unheard)
 
     def on_clocks(self, boots: Mapping[str, str]) -> Calibration:

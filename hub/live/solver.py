@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from hub.calibration.pipeline import heads_of_people
 from hub.calibration.triangulation import triangulate
 from hub.clocks.external_prior import ExternalClockPrior
 from protocols.core.errors import InputError, Refused
-from protocols.session.calibration import Calibration
+from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -36,8 +36,8 @@ arrival it finds nothing more."""
 _LEFT_OUT_S = 60.0
 """How long a camera is left out without which the solver does not fail."""
 _UNLIKE_OTHERS = 2.5
-"""Times the median camera's residuals of people: of simulated rigs at most 1.2 as calibrated, and 2.3 to 3.2 where a
-camera was turned by a degree."""
+"""Times the median camera's residuals of people, as angles: of simulated rigs at most 1.2 as calibrated, and 2.3 to 3.2
+where a camera was turned by a degree."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +155,13 @@ def run_job(job: SolverJob, cpu_clock: Callable[[], float] = time.process_time) 
 def _verified(job: SolverJob) -> Calibration:
     """The last answer without the cameras that the rows contradict. Raises Refused where they contradict all of it."""
     assert job.last is not None
-    heard = {name: camera for name, camera in job.last.cameras.items() if name in job.rig.cameras}
+    of_people = job.rig.metadata.get("target") == "person"
+    # Residuals of people are compared with each other: those of the marker it was calibrated with say nothing of them.
+    heard = {
+        name: replace(camera, rms_px=0.0) if of_people else camera
+        for name, camera in job.last.cameras.items()
+        if name in job.rig.cameras
+    }
     found = triangulate(job.rig, heard, heads_of_people(job.rig, job.observations))
     kept = {name: camera for name, camera in job.last.cameras.items() if name not in found.contradicted}
     return Calibration(
@@ -166,16 +172,17 @@ def _verified(job: SolverJob) -> Calibration:
         job.last.solver,
         job.last.version,
         refused={name: found.unused[name] for name in found.contradicted},
-        warnings=_unlike_others(found.sigma_px) if job.rig.metadata.get("target") == "person" else found.warnings,
+        warnings=(*found.warnings, *(_unlike_others(found.sigma_px, heard) if of_people else ())),
     )
 
 
-def _unlike_others(sigma_px: Mapping[str, float]) -> tuple[str, ...]:
-    """Warnings of cameras whose people fit far worse than the others'. The residuals of markers say nothing of them."""
-    typical = float(np.median(list(sigma_px.values())))
+def _unlike_others(sigma_px: Mapping[str, float], cameras: Mapping[str, CameraCalibration]) -> tuple[str, ...]:
+    """Warnings of cameras whose people fit far worse, as angles, than the others'; it takes three cameras."""
+    sigmas = {name: sigma / float(cameras[name].intrinsics.matrix[0, 0]) for name, sigma in sigma_px.items()}
+    typical = float(np.median(list(sigmas.values())))
     return tuple(
-        f"{name}: residuals of {sigma:.1f} px, {typical:.1f} px of the median camera: was it moved?"
-        for name, sigma in sigma_px.items()
+        f"{name}: residuals of {1e3 * sigma:.1f} mrad, {1e3 * typical:.1f} mrad of the median camera: was it moved?"
+        for name, sigma in sigmas.items()
         if sigma > _UNLIKE_OTHERS * typical
     )
 

@@ -8,13 +8,14 @@ ambiguous are left out.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from protocols.core.clocks import NANOSECONDS
+from protocols.core.clocks import NANOSECONDS, CameraTime, TimeMap
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.observations import Observations, gather_tracks
@@ -112,6 +113,33 @@ class PeopleTracklets:
         if held is None:
             return 0.0
         return sum((t.rows[-1].time_ns - t.rows[0].time_ns) / NANOSECONDS for t in held.all() if t.rows)
+
+    def shared_seconds(self, clocks: Mapping[str, TimeMap]) -> dict[str, float]:
+        """By camera, the duration of its tracklets [s] while another of them sees somebody, by the given clocks."""
+        spans = {
+            name: [
+                (
+                    clock.reference_from_camera(CameraTime(t.rows[0].time_ns / NANOSECONDS)),
+                    clock.reference_from_camera(CameraTime(t.rows[-1].time_ns / NANOSECONDS)),
+                )
+                for t in self._cameras[name].all()
+                if t.rows
+            ]
+            for name, clock in clocks.items()
+            if name in self._cameras
+        }
+        shared = dict.fromkeys(clocks, 0.0)
+        for name, own in spans.items():
+            seen: list[list[float]] = []
+            for first, last in sorted(span for other, theirs in spans.items() if other != name for span in theirs):
+                if seen and first <= seen[-1][1]:
+                    seen[-1][1] = max(seen[-1][1], last)
+                else:
+                    seen.append([first, last])
+            shared[name] = sum(
+                max(min(last, end) - max(first, begin), 0.0) for begin, end in own for first, last in seen
+            )
+        return shared
 
     @property
     def cameras(self) -> list[str]:

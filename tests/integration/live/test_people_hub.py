@@ -15,8 +15,8 @@ from deploy.demo.people import score_log
 from deploy.simulation.session import camera_tables
 from edge import scenes
 from hub.live.agent import run_hub, status_message
-from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
-from hub.live.solver import SolverJob
+from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings, merge_rigs
+from hub.live.solver import SolverJob, _unlike_others
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
@@ -29,6 +29,7 @@ from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, read_calibration
+from protocols.session.rig import Rig
 from protocols.topics import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
 from tests.support.people_traffic import Traffic, film
 from tests.support.samples import camera_info, eventually
@@ -180,6 +181,47 @@ def test_a_reloaded_answer_is_verified_by_people_where_there_is_no_marker(known:
     assert hub.calibration is not None
     assert hub.calibration.trajectories
     assert [job.last is None or job.last.trajectories for job in jobs] == [()] * 3
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_people_who_walk_from_one_view_to_the_next_contradict_no_calibration(known: Path, given: bool) -> None:
+    """A restarted hub threw a right calibration away, and a given one was `degraded`: their clocks shared no time."""
+    traffic, (rig, cameras) = film(SCENE, 80.0, 21), read_calibration(known)
+    delays = {message.camera: 1e9 + at - message.device_time_ns / NANOSECONDS for at, message in traffic.arrivals}
+    hub = LiveHub(known=KnownCalibration(rig, cameras) if given else None)
+    hub.reload(
+        Calibration(cameras, traffic.reference, "metric", "m", "joint", "1"), dict.fromkeys(cameras, "boot0"), delays
+    )
+    for info in traffic.infos:
+        hub.handle(info)
+    for at, message in traffic.arrivals:
+        if message.camera != f"cam{int(at // 40.0)}":
+            del message.detections[:]
+        hub.handle(message, 1e9 + at)
+        hub.tick(at)
+    assert sum(hub.stream.people.seconds(name) > 40.0 for name in cameras) == 2
+    assert hub.calibration is not None
+    assert set(hub.calibration.cameras) == set(cameras)
+    reason = hub.state(at)[1]
+    assert (
+        reason == ("" if given else "the calibration was reloaded and is not verified yet; ") + "4 cameras calibrated"
+    )
+
+
+def test_a_camera_with_a_finer_image_was_not_moved(known: Path) -> None:
+    cameras = read_calibration(known)[1]
+    lens = cameras["cam3"].intrinsics
+    finer = replace(lens, matrix=lens.matrix * np.array([[3.0], [3.0], [1.0]]))
+    cameras["cam3"] = replace(cameras["cam3"], intrinsics=finer)
+    sigmas = dict.fromkeys(cameras, 1.0)
+    assert _unlike_others({**sigmas, "cam3": 3.0}, cameras) == ()
+    assert [text[:4] for text in _unlike_others({**sigmas, "cam2": 3.0}, cameras)] == ["cam2"]
+
+
+def test_what_is_seen_is_the_target_whatever_the_hubs_own_file_says() -> None:
+    own = Rig({}, metadata={"target": "charuco:7x5", "scene": "yard"})
+    assert merge_rigs(Rig({}, metadata={"target": "person"}), own).metadata == {"target": "person", "scene": "yard"}
+    assert merge_rigs(Rig({}), own).metadata["target"] == "charuco:7x5"
 
 
 @pytest.mark.parametrize(("turned", "state"), [(0.0, "calibrated"), (0.02, "degraded"), (0.14, "degraded")])
