@@ -30,7 +30,7 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".
 FOLDER_FPS = 30.0
 """Default frame rate of an image folder [Hz]."""
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".ts", ".3gp", ".mpg"})
-_CUT_S = 1.0  # s: durations of containers count the last frame, and often sound that goes on for longer
+_CUT_S = 0.5  # s: durations of containers count the last frame, and often sound that goes on for longer
 _CONVERT = "check that it is a video this machine can decode (try another player, or convert it to mp4)"
 
 
@@ -177,7 +177,8 @@ class VideoReader:
             last = time
             yield VideoFrame(frame, time, image)
             frame += 1
-        if math.isfinite(stamp) and not self.resized and stamp + _CUT_S < self.info.end:
+        lasting = max(_CUT_S, 1.5 / self.info.fps)
+        if math.isfinite(stamp) and not self.resized and stamp + lasting < self.info.end:
             says = f"its container says {self.info.end:.1f} s"
             self.cut = f"it ends at {stamp:.1f} s, {says}: the file seems to be cut off"
 
@@ -264,6 +265,8 @@ def _stated_end(container: InputContainer) -> float:
     """Time [s] at which a video ends according to its container; NaN where that says nothing."""
     stream = container.streams.video[0]
     begin = float((stream.start_time or 0) * (stream.time_base or 0))
+    if container.format.name == "avi" and stream.frames and stream.average_rate:
+        return begin + float(stream.frames / stream.average_rate)  # FFmpeg's duration is of what is there
     if stream.duration and stream.time_base:
         return begin + float(stream.duration * stream.time_base)
     # Matroska has durations of tracks in tags, as 00:00:13.998000000, and one of the whole file.
