@@ -312,7 +312,9 @@ class Backfill(Generic[_Source]):
         self._push(source, key, payload)
         held.low += 1
         while held.low in held.early:
-            self._push(source, key, held.early.pop(held.low))
+            early = held.early.pop(held.low)
+            self._keep(held, -len(early))
+            self._push(source, key, early)
             held.low += 1
 
     def _question(self, who: tuple[str, _Source], held: _PendingMessages) -> RecoveryQuery[_Source]:
@@ -346,15 +348,18 @@ class Backfill(Generic[_Source]):
                 self._push(source, key, message)
             if missing := held.first - held.low - len(held.early):
                 self._lost(missing)
-        while held.later:
-            number, payload = held.later.popleft()
+        later, size = held.later, held.bytes if held.joining else held.bytes - sum(map(len, held.early.values()))
+        while later:
+            number, payload = later.popleft()
             behind = (number - expected) % _SEQUENCE_MODULUS >= _SEQUENCE_MODULUS // 2
             if number > expected and not behind:
                 question = self._hold(who, expected, number, payload, joining=False)
-                rest = self._held[who]
-                rest.later.extend(held.later)
-                self._keep(rest, sum(len(one[1]) for one in held.later))
+                # Of many gaps: neither copied nor counted again at each.
+                later.appendleft((number, payload))
+                self._held[who].later = later
+                self._keep(self._held[who], size - len(payload))
                 return question
+            size -= len(payload)
             if not behind:
                 self._push(source, key, payload)
                 expected = (number + 1) % _SEQUENCE_MODULUS

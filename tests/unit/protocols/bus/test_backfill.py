@@ -208,6 +208,16 @@ def test_a_second_gap_while_the_first_one_waits_is_asked_for_too() -> None:
     assert stage.lost == 0
 
 
+def test_of_many_gaps_each_is_asked_for_in_turn_and_nothing_stays_held_back() -> None:
+    stage = Stage()
+    stage.take("a", 0, 2, 4, 5, 8)
+    for gap in ((1,), (3,), (6, 7)):
+        assert (stage.asked[-1].low, stage.asked[-1].high) == (gap[0], gap[-1])
+        stage.answer(*gap)
+    assert stage.out == names(*range(9))
+    assert stage.backfill._bytes == 0
+
+
 def test_who_never_answers_holds_its_messages_up_for_a_while_only() -> None:
     stage = Stage()
     stage.take("a", 0, 3)
