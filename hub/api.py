@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import pandas
 
     from hub.clocks.external_prior import ExternalClockPrior
+    from protocols.messages import syncline_pb2 as pb
 
 CALIBRATION, TRAJECTORY, RESULT, REPORT = "calibration.toml", "trajectory.csv", "result.json", "report.html"
 Progress: TypeAlias = Callable[[str, float], None]
@@ -157,9 +158,11 @@ class TriangulationResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedSession(Session):
-    """A session from a recorded log. clock_priors: external clock priors (NTP, PTP) of its cameras, by name."""
+    """A session as it was recorded. clock_priors: external clock priors (NTP, PTP) of its cameras, by name. people:
+    detections of several people whom nobody has told apart, each with head and foot, in place of observations."""
 
     clock_priors: Mapping[str, ExternalClockPrior] = field(default_factory=dict)
+    people: tuple[pb.Observation, ...] = field(default=(), kw_only=True)
 
 
 def read_session(path: str | Path, observations: str | Path | None = None) -> Session:
@@ -205,6 +208,8 @@ def calibrate(
         remedy = "leave --from-known and --solver out"
         raise InputError("--refine-lenses goes with --solver joint and without --from-known", remedy=remedy)
     session = session if isinstance(session, Session) else read_session(session)
+    if isinstance(session, RecordedSession) and session.people:
+        return _from_people(session, options, progress)
     known = None
     if options.from_known is not None:
         known, rig = _fixed(Path(options.from_known), session.rig)
@@ -244,6 +249,26 @@ def calibrate(
         speed = unlikely_speed(found.scale, found.units, found.trajectories)
         found = replace(found, warnings=(*found.warnings, *speed))
     return CalibrationResult(replace(found, cpu_seconds=spent, warnings=session.warnings + found.warnings), session)
+
+
+def _from_people(session: RecordedSession, options: CalibrationOptions, progress: Progress | None) -> CalibrationResult:
+    """The calibration by unlabelled people, whose heads and feet become the session's observations."""
+    from hub.calibration.people.unlabelled import calibrate_people
+
+    if options.solver != "joint" or options.from_known is not None or options.refine_lenses:
+        what = "people whom nobody has told apart go with --solver joint, without --from-known and --refine-lenses"
+        raise InputError(what, remedy="leave these out, or label the people: one label a person in all cameras")
+    began = time.process_time()
+    try:
+        found, observations = calibrate_people(
+            session.rig, session.people, progress, priors=session.clock_priors, seed=options.seed
+        )
+    except Refused as refused:
+        refused.warnings, refused.cpu_seconds = session.warnings, time.process_time() - began
+        raise
+    spent, warnings = time.process_time() - began, session.warnings + found.warnings
+    read = replace(session, observations=observations)
+    return CalibrationResult(replace(found, cpu_seconds=spent, warnings=warnings), read)
 
 
 def _with_associated_people(session: Session, progress: Progress | None, known: FixedCalibration | None) -> Session:

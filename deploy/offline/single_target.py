@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from edge.offline.detections import HEADER
 
@@ -52,6 +52,22 @@ def rows_of_one_target(rows: Sequence[str]) -> tuple[tuple[str, ...], int, int]:
         row = cells[index]
         writer.writerow([*row[:label], row[kind] or cells[kept[0]][label], *row[label + 1 :]])
     return tuple(out.getvalue().splitlines()), sum(beside), 1
+
+
+def rows_of_unlabelled_people(videos: Iterable[Sequence[str]]) -> list[str]:
+    """All rows of several videos, without labels, where at least one has several people and all are people; else none.
+
+    A detector's labels are of one video: who is who in two is not known.
+    """
+    label, kind = (HEADER.split(",").index(name) for name in ("label", "kind"))
+    given = [tuple(rows) for rows in videos]
+    cells = [row for rows in given for row in csv.reader(rows)]
+    crowded = any(rows_of_one_target(rows)[2] > 1 for rows in given)
+    if not crowded or any(row[kind] != "person" for row in cells):
+        return []
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([*row[:label], "", *row[label + 1 :]] for row in cells)
+    return out.getvalue().splitlines()
 
 
 def rows_of_head_and_foot(rows: Sequence[str]) -> tuple[str, ...]:

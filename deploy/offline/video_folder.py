@@ -20,8 +20,9 @@ import numpy as np
 import tomli_w
 
 from deploy.offline.progress import Progress
+from deploy.offline.people_session import read_people
 from deploy.offline.recognition import DETECTORS, Target, find_target
-from deploy.offline.single_target import rows_of_head_and_foot, rows_of_one_target
+from deploy.offline.single_target import rows_of_head_and_foot, rows_of_one_target, rows_of_unlabelled_people
 from edge.detectors import base as detector_base
 from edge.detectors.base import Detector
 from edge.detectors.board.description import BOARD_FILE, Board
@@ -162,12 +163,13 @@ def session_from_videos(
     of_ends = target.kind == "person" and all(lens is not None for lens in measured)
     lines: list[str] = list(target.notes)
     rows: list[str] = []
+    unlabelled = [] if target.board is not None else rows_of_unlabelled_people(one.rows for one, _ in found.values())
     for video in videos:
         if video.camera not in found:
             continue
         one, kept = found[video.camera]
         several = False
-        if target.board is None:
+        if target.board is None and not unlabelled:
             one, several = _one_target(video, one, what, warnings)
         rows += rows_of_head_and_foot(one.rows) if of_ends else one.rows
         again = " (kept from before)" if kept else ""
@@ -194,7 +196,13 @@ def session_from_videos(
         metadata["target"] = target.text
     # [metadata] goes first, so that its keys do not end up in the last camera's table.
     rig_text = tomli_w.dumps({"metadata": metadata, **tables} if metadata else tables)
-    write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: observations_csv(rows)})
+    table = observations_csv(unlabelled or rows)
+    write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: table})
+    if unlabelled:
+        rig, people = read_people(session / OBSERVATIONS_FILE, session / RIG_FILE)
+        return VideoSession(
+            rig, Observations({}), tuple(warnings), folder.name, priors, tuple(lines), refusal, people=people
+        )
     if not rows:
         refusal = refusal or _unseen(target.board)
         rig = read_rig(session / RIG_FILE)

@@ -120,6 +120,7 @@ def final_adjustment(
     warm: bool = False,
     online: bool = False,
     refine_lenses: bool = False,
+    shared_errors: bool = False,
 ) -> Reconstruction:
     """The final adjustment, with readouts estimated where the data clearly support it.
 
@@ -127,6 +128,8 @@ def final_adjustment(
     kept exactly. warm: the state is near the solution. online: a part of a recording that goes on. Then readouts are
     not estimated: on the first 70 to 110 s of a real rig they came out at -34 and +42 ms with stds of 10 ms, after
     130 s not at all. And the re-fit with correlated noise, which makes early stds honest, waits for less correlation.
+    shared_errors: whether points are off together, as both ends of a box are: that passes for readouts, jitter and
+    steps of clocks, of which none is looked for then.
     """
     report("adjusting", 0.75)
     problem, state = reconstruction.problem, reconstruction.state
@@ -144,13 +147,14 @@ def final_adjustment(
             return reconstruction  # the camera will be left out
     rounds = 2 if warm or len(state.cameras) > LARGE_NETWORK else 4
     problem, state, _ = adjust(problem, state, rounds=rounds, progress=lambda text: report(text, 0.75))
-    if not (warm and online):
+    if not (warm and online or shared_errors):
         even = problem, state
         problem, state = _with_fewer_steps(even, _with_clock_steps(*even))
         problem, state = (problem, state) if online else _steps_or_rates(even, (problem, state))
-    if not online and problem.free_parameters.clock:
+    if not (online or shared_errors) and problem.free_parameters.clock:
         problem, state = _with_readouts(problem, state, report)
-    problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8), newest=online)
+    if not shared_errors:
+        problem, state = estimate_frame_times(problem, state, lambda text: report(text, 0.8), newest=online)
     problem = model_comparison.with_crystal_rates(problem, state)
     if refine_lenses and not warm:
         report("adjusting the lenses", 0.85)

@@ -154,16 +154,24 @@ def solve_network(
     online: bool = False,
     refine_lenses: bool = False,
     thorough: bool = False,
+    clocks: Mapping[str, TimeMapEstimate] | None = None,
 ) -> Solution:
     """One adjusted network from the pairs; cameras that do not fit are refused with a reason.
 
     place: an adjusted network of a clock graph's cameras, and reasons of those that it leaves out; None = incremental
-    reconstruction and bundle adjustment.
+    reconstruction and bundle adjustment. clocks: initial time maps of the cameras that ``place`` takes, where they do
+    not come from pairs.
     """
     refused = dict(prepared.refused)
     final = partial(final_adjustment, report=report, online=online, refine_lenses=refine_lenses)
     free_parameters = FreeParameters(clock=not prepared.shared_clock)
-    graph = _largest_component(prepared, list(prepared.cameras), pairs, refused)
+
+    def connected(names: list[str], pairs: list[PairSolution]) -> ClockGraph:
+        if clocks is None:
+            return _largest_component(prepared, names, pairs, refused)
+        return ClockGraph({name: clocks[name] for name in names if name in clocks}, (), ())
+
+    graph = connected(list(prepared.cameras), pairs)
     unfit, failures = set[str](), CameraTests()
     with_rate_prior = replace(free_parameters, rate_std=_rate_prior_std(graph, free_parameters.rate_std))
     placed: dict[str, CameraState] = {}
@@ -200,7 +208,7 @@ def solve_network(
             raise Refused(f"no two cameras can be placed ({worst}: {failed.reason})", refused, acceptance=failures)
         states = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
         placed = {name: states[name] for name in remaining} if len(inconsistent) < 2 and len(remaining) > 2 else {}
-        graph = _largest_component(prepared, remaining, list(graph.inlier_pairs), refused)
+        graph = connected(remaining, list(graph.inlier_pairs))
     unconnected = [name for name in prepared.cameras if name in refused and name not in unfit]
     if thorough and unconnected and not prepared.shared_clock:
         report("resection of further cameras", 0.93)

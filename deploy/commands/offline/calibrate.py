@@ -74,11 +74,12 @@ def calibrate(
         folder of videos, otherwise the orange ball of the demo.
     detector
         For videos: what moves in them. charuco, chessboard: the board that board.toml describes. tag: ArUco or AprilTag
-        tags. bright: a point of light. marker: a coloured ball. person, vehicle: only one at a time in view, with fixed
-        cameras. auto (default): looks at some frames with all of them. Or the .toml file of an ONNX network, or a
-        detector that another package registers: only one target at a time in view.
+        tags. bright: a point of light. marker: a coloured ball. person, with fixed cameras: one, or several of whom nobody
+        knows who is who, with measured lenses. vehicle: only one at a time in view, with fixed cameras. auto (default): looks at some frames with all of them. Or the .toml file of an ONNX network, or a
+        detector that another package registers: people, or only one target at a time in view.
     height
-        For keypoints: the people's (mean) height [rig units], which gives the scale by thighs and shanks (about 3 %).
+        For keypoints and people without labels: their (mean) height [rig units], which gives the scale; of keypoints
+        by thighs and shanks (about 3 %).
     limb
         The distance between two labels, as left_knee-left_ankle=0.41 [rig units]: gives the scale. Of several people
         it is the mean.
@@ -145,7 +146,10 @@ def _load(
         raise InputError("--marker goes with a folder of videos", remedy="leave it out for a session")
     if detector is not None:
         raise InputError("--detector goes with a folder of videos", remedy="leave it out for a session")
-    return read_session(session, observations)
+    from deploy.offline.people_session import people_of_log, people_session
+
+    people = people_session(session, observations) if session.is_dir() else None
+    return people or people_of_log(session, read_session(session, observations))
 
 
 def _with_scale(read: Session, height: float | None, limb: str | None) -> Session:
@@ -166,7 +170,8 @@ def _with_scale(read: Session, height: float | None, limb: str | None) -> Sessio
     if height is not None:
         if not 0.0 < height < 1e6:
             raise InputError(f"--height {height:g} is out of range", remedy="give the person's height in rig units")
-        limbs = limbs_of_height(height, labels)
+        of_people = bool(getattr(read, "people", ()))
+        limbs = [("head", "foot", height)] if of_people else limbs_of_height(height, labels)
         if not limbs:
             remedy = "it needs joints named left_hip, left_knee, left_ankle; or give --limb a-b=LENGTH"
             raise InputError("--height: no thigh or shank among the labels", remedy=remedy)

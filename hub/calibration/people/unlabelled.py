@@ -1,0 +1,253 @@
+"""Calibration from people whom nobody has told apart: unlabelled boxes, or heads and feet, of several at once.
+
+Each camera finds the ground by the sizes of upright people; cameras are registered on it by where people stand; with
+these poses people are followed through all cameras, and their heads and feet are adjusted as labelled points.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hub.bundle.initialisation import Reconstruction, triangulate_and_adjust
+from hub.bundle.preprocessing import PreparedSession, prepare
+from hub.bundle.problem import CameraState, FreeParameters
+from hub.calibration.final_adjustment import final_adjustment
+from hub.calibration.pairs.pair_network import Progress
+from hub.calibration.people.ground_plane import Bodies, GroundPlane, estimate_ground_plane
+from hub.calibration.people.registration import GroundPoints, Registration, lag_grid, register, rotation
+from hub.calibration.result import assemble_calibration
+from hub.calibration.solvers import solve_network
+from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
+from hub.clocks.external_prior import ExternalClockPrior
+from hub.tracking.offline import follow
+from protocols.core.clocks import NANOSECONDS, TimeMap
+from protocols.core.errors import Refused
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.pose import Pose
+from protocols.geometry.types import Floats
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.calibration import Calibration, CameraCalibration
+from protocols.session.observations import Observations, gather_tracks
+from protocols.session.rig import Rig
+
+STATURE_M = 1.7  # of adults, mean: only tells the tracker how fast people are; the published scale does not rest on it
+_END_STD = 0.03  # of a body's image height: a detector's box
+_FAR = 25.0  # heights of the camera: beyond, an error of a box's end is a person's height on the ground
+_COMMON_S, _COMMON_SHARE = 20.0, 0.5  # that two recordings have in common at the lags that are tried, at least
+_KNOWN_LAG_S = 1.0  # about a lag that other pairs give
+_ROWS_OF_PERSON = 12  # in all cameras: fewer are too short a path to be worth two points
+_INITIAL_RMS_PX, _INITIAL_LAG_STD_S = 5.0, 0.1  # of the registration, for the tracker
+_INTERVAL_S = 0.19  # of the frames that are used, at least: a walker goes 0.3 m, and a detector's errors last as long
+_WANTED_INTERVAL_NS = NANOSECONDS // 2  # at which the tracker's paths are asked for; only their detections are used
+
+
+def calibrate_people(
+    rig: Rig,
+    messages: Sequence[pb.Observation],
+    progress: Progress | None = None,
+    *,
+    priors: Mapping[str, ExternalClockPrior] | None = None,
+    seed: int = 0,
+) -> tuple[Calibration, Observations]:
+    """Timing and poses from unlabelled people, and their heads and feet as labelled points.
+
+    messages: of all cameras, each detection with its head and foot [px]; of a box the middles of its top and bottom.
+    A scale bar ("head", "foot", length) of the rig is the people's mean height [rig units]. priors: of clocks; lags
+    that contradict them are not tried. seed: of the hypotheses. Raises Refused, with reasons by camera.
+    """
+    report = progress or (lambda text, share: None)
+    rng = np.random.default_rng(seed)
+    messages = _thinned(messages)
+    refused: dict[str, str] = {}
+    planes: dict[str, GroundPlane] = {}
+    points: dict[str, GroundPoints] = {}
+    for name, camera in rig.cameras.items():
+        mine = [message for message in messages if message.camera == name]
+        if not camera.is_measured or camera.intrinsics is None:
+            refused[name] = "no intrinsics: people of unknown size tell no focal length; run `syncline intrinsics`"
+        elif (plane := estimate_ground_plane(_bodies(mine, camera.intrinsics))) is None:
+            refused[name] = "the sizes of its people tell no ground plane: it needs 40 whole people all over its picture"
+        else:
+            planes[name], points[name] = plane, _ground_points(mine, camera.intrinsics, plane)
+    placed = _placed(rig, points, priors or {}, rng, report)
+    for name in planes.keys() - placed.keys():
+        refused[name] = "its people do not meet the other cameras' on the ground in one way only"
+    if len(placed) < 2:
+        reason = "no two cameras see the same people on one ground" + "".join(f"; {n}: {r}" for n, r in refused.items())
+        raise Refused(reason, {name: refused.get(name, reason) for name in rig.cameras})
+    report("following people", 0.5)
+    initial = {name: _initial(name, rig, planes[name], found) for name, found in placed.items()}
+    observations = _labelled(rig, messages, initial)
+    bars = [bar for bar in rig.scale_bars if bar[:2] == ("head", "foot")]
+    rig = replace(rig, metadata=rig.metadata | {"target": "person"}, scale_bars=())
+    prepared = prepare(rig, observations)
+    # The stds are ours, of any detector: only their ratios are meant.
+    cameras = {name: replace(camera, stated_std=0.0) for name, camera in prepared.cameras.items()}
+    prepared = replace(prepared, cameras=cameras, refused=prepared.refused | refused)
+    poses = {name: camera.pose for name, camera in initial.items()}
+    clocks = _time_maps(prepared, initial)
+
+    def place(graph: ClockGraph) -> tuple[Reconstruction, dict[str, str]]:
+        states = {
+            name: CameraState(prepared.cameras[name].intrinsics, poses[name], one.rate, one.offset, one.centre)
+            for name, one in graph.clocks.items()
+        }
+        names, free = list(states), FreeParameters(clock=not prepared.shared_clock)
+        start = triangulate_and_adjust(
+            prepared.cameras, states, prepared.rows, prepared.labels, (names[0], names[1]), free
+        )
+        found = final_adjustment(start, report, shared_errors=True)
+        # Both ends of a body are off together across it: two rows say there what one does.
+        return replace(found, state=replace(found.state, sigma=np.sqrt(2.0) * found.state.sigma)), {}
+
+    solution = solve_network(prepared, [], report, place, clocks=clocks)
+    report("covariances", 0.95)
+    solved = set(solution.reconstruction.labels)
+    people = sorted(label.rpartition("-")[0] for label in solved if label.endswith("-head"))
+    both = [(f"{one}-head", f"{one}-foot") for one in people if f"{one}-foot" in solved]
+    rig = replace(rig, scale_bars=tuple((*ends, length) for *_, length in bars for ends in both))
+    return assemble_calibration(rig, solution), observations
+
+
+def _thinned(messages: Sequence[pb.Observation]) -> list[pb.Observation]:
+    """Frames of each camera that are at least `_INTERVAL_S` apart, in the order of their times."""
+    kept, last = list[pb.Observation](), dict[str, int]()
+    for one in sorted(messages, key=lambda one: one.device_time_ns):
+        if one.camera not in last or one.device_time_ns - last[one.camera] >= _INTERVAL_S * NANOSECONDS:
+            kept.append(one)
+            last[one.camera] = one.device_time_ns
+    return kept
+
+
+def _bodies(messages: Sequence[pb.Observation], lens: Intrinsics) -> Bodies:
+    """Everybody whose head and foot are seen."""
+    ends = np.array([[*d.head, *d.foot] for one in messages for d in one.detections if d.head and d.foot])
+    return _normalised(ends.reshape(-1, 4), lens)
+
+
+def _normalised(ends: Floats, lens: Intrinsics) -> Bodies:
+    """Bodies of heads and feet (n, 4) [px]."""
+    middle = 0.5 * (ends[:, :2] + ends[:, 2:])
+    parts = [middle, ends[:, :2], ends[:, 2:]]
+    centre, head, foot = lens.unproject(np.concatenate(parts)).reshape(3, -1, 2)
+    good = np.isfinite(np.column_stack([centre, head, foot])).all(axis=1) & (foot[:, 1] > head[:, 1])
+    return Bodies(centre[good], head[good, 1], foot[good, 1])
+
+
+def _ground_points(messages: Sequence[pb.Observation], lens: Intrinsics, plane: GroundPlane) -> GroundPoints:
+    times, places = [], []
+    for message in messages:
+        where, below = plane.places(_bodies([message], lens))
+        near = np.linalg.norm(where, axis=1) < _FAR * plane.height
+        times.append(message.device_time_ns / NANOSECONDS)
+        places.append(where[below & near])
+    return GroundPoints(np.array(times), places)
+
+
+def _placed(
+    rig: Rig,
+    points: Mapping[str, GroundPoints],
+    priors: Mapping[str, ExternalClockPrior],
+    rng: np.random.Generator,
+    report: Progress,
+) -> dict[str, Registration]:
+    """The largest group of registered cameras: each one's place in the axes of the first, and its lag."""
+    pairs = list(itertools.combinations(sorted(points, key=lambda name: -sum(map(len, points[name].places))), 2))
+    edges: dict[tuple[str, str], Registration] = {}
+    for done, (a, b) in enumerate(pairs):
+        report(f"people of {a} and {b}", 0.4 * done / len(pairs))
+        known = _grow(a, edges).get(b)
+        if rig.shared_clock:
+            lags = np.zeros(1)
+        elif known is not None:
+            lags = lag_grid(points[a], points[b], 0.0)
+            lags = lags[np.abs(lags - known.lag) <= _KNOWN_LAG_S]
+        else:
+            shorter = min(float(np.ptp(points[name].time)) for name in (a, b))
+            lags = lag_grid(points[a], points[b], min(_COMMON_S, _COMMON_SHARE * shorter))
+            if a in priors and b in priors:
+                expected = priors[b].unix_minus_camera - priors[a].unix_minus_camera
+                reach = priors[a].error_bound + priors[b].error_bound + _KNOWN_LAG_S
+                lags = lags[np.abs(lags - expected) <= reach]
+        found = register(points[a], points[b], lags, rng) if len(lags) else None
+        if found is not None and found.accepted:
+            edges[a, b] = found
+    return max((_grow(name, edges) for name in rig.cameras), key=len)
+
+
+def _grow(first: str, edges: Mapping[tuple[str, str], Registration]) -> dict[str, Registration]:
+    """All cameras that are connected with one, over the pairs with most meetings first."""
+    placed = {first: Registration(0.0, np.zeros(2), 0.0, 0)}
+    both = edges | {(b, a): one.inverse() for (a, b), one in edges.items()}
+    while more := [pair for pair in both if pair[0] in placed and pair[1] not in placed]:
+        a, b = max(more, key=lambda pair: both[pair].meetings)
+        placed[b] = both[a, b].after(placed[a])
+    return placed
+
+
+def _initial(name: str, rig: Rig, plane: GroundPlane, found: Registration) -> CameraCalibration:
+    """A registered camera, in metres for people of `STATURE_M`; the ground is z = 0."""
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(found.angle)
+    pose = Pose((turn @ plane.local_from_camera).T, STATURE_M * np.append(found.shift, plane.height))
+    lens = rig.cameras[name].intrinsics
+    assert lens is not None
+    std = 0.0 if rig.shared_clock else _INITIAL_LAG_STD_S
+    return CameraCalibration(name, lens, pose, TimeMap(1.0, found.lag), std, np.zeros(3), _INITIAL_RMS_PX)
+
+
+def _labelled(rig: Rig, messages: Sequence[pb.Observation], initial: dict[str, CameraCalibration]) -> Observations:
+    """Heads and feet of everybody who is followed in two cameras or more, as ``person1-head``, ``person1-foot``, …"""
+    up = np.array([0.0, 0.0, 1.0])
+    start = Calibration(initial, next(iter(initial)), "metric", "m", "", "")
+    seen = [one for one in messages if one.camera in initial]
+    lags = {name: round(camera.time_map.time_offset * NANOSECONDS) for name, camera in initial.items()}
+    times = [one.device_time_ns + lags[one.camera] for one in seen]
+    followed = follow(seen, start, range(min(times), max(times) + 1, _WANTED_INTERVAL_NS), up=up)
+    by_key = {(one.camera, one.sequence): one for one in seen}
+    names, labels, frames, moments, pixels, stds = [], [], [], [], [], []
+    for track in followed.tracks:
+        if len({name for name, _, _ in track.detections}) < 2 or len(track.detections) < _ROWS_OF_PERSON:
+            continue
+        for name, sequence, index in track.detections:
+            message, camera = by_key[name, sequence], initial[name]
+            one = message.detections[index]
+            if not (one.head and one.foot):
+                continue
+            body = _normalised(np.array([[*one.head, *one.foot]]), camera.intrinsics)
+            if not len(body.top):
+                continue
+            ends = camera.intrinsics.project_normalised(body.ends(camera.pose.rotation @ up)[:, 0])
+            for end, pixel in zip(("head", "foot"), ends, strict=True):
+                names.append(name)
+                labels.append(f"person{track.id}-{end}")
+                frames.append(message.frame)
+                moments.append(message.device_time_ns / NANOSECONDS)
+                pixels.append(pixel)
+                stds.append(_END_STD * float(np.linalg.norm(ends[1] - ends[0])))
+    if not labels:
+        raise Refused("nobody can be followed from one camera to another", dict.fromkeys(rig.cameras, "nobody to follow"))
+    return gather_tracks(
+        names,
+        labels,
+        np.array(frames, dtype=np.int64),
+        np.array(moments),
+        np.array(pixels),
+        np.full(len(names), np.nan),
+        stds=np.array(stds),
+        order=rig.cameras,
+    )
+
+
+def _time_maps(prepared: PreparedSession, initial: Mapping[str, CameraCalibration]) -> dict[str, TimeMapEstimate]:
+    """The registered lags as maps between times from the session's origins."""
+    names = [name for name in prepared.cameras if name in initial]
+    base = initial[names[0]].time_map.time_offset + prepared.time_origins[names[0]] if names else 0.0
+    return {
+        name: TimeMapEstimate(1.0, initial[name].time_map.time_offset + prepared.time_origins[name] - base, 0.0)
+        for name in names
+    }
