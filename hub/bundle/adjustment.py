@@ -22,6 +22,7 @@ from hub.bundle.problem import (
     Column,
     Problem,
     TrackObservations,
+    Trajectory,
 )
 from hub.bundle.residuals import residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
@@ -33,6 +34,7 @@ from protocols.geometry.types import Floats
 from protocols.session.calibration import AdjustmentStep
 
 _OUTLIER_SIGMA = 5.0  # rows beyond this many sigma are rejected as outliers
+_LEAST_DEPTH = 0.01  # of the camera's median: targets come to a tenth of it, and paths that collapse to 1e-14
 _DAMPING, _LEAST_DAMPING = 1e-9, 1e-12
 """Of the diagonal: first one of robust rounds, and of all others. What bends a chain hardly changes the cost: with 1e-4
 rounds ended before it was moved, and 160 cameras were 53 mm off (rms) in place of 35 (`tests.bench.street`)."""
@@ -83,6 +85,7 @@ def adjust(
     if not coarse:
         most = iterations if rounds <= 2 else _MORE_ITERATIONS * iterations
         state = minimise(problem, state, prior, robust, most, _FINE_TOLERANCE, steps, coarse)
+        problem = without_collapsed(problem, state)
         state = replace(state, sigma=estimate_noise(problem, state, prior))
     return problem, replace(state, steps=tuple(steps)), prior
 
@@ -94,7 +97,27 @@ def mark_inliers(problem: Problem, state: AdjustmentState) -> Problem:
         norms = residual_norms(rows, state.cameras[rows.camera], state.trajectories[rows.label])
         with np.errstate(invalid="ignore"):
             out.append(rows.using(norms < _OUTLIER_SIGMA * state.sigma[rows.camera]))
-    return replace(problem, rows=tuple(_reject_single_views(out, state)))
+    return without_collapsed(replace(problem, rows=tuple(_reject_single_views(out, state))), state)
+
+
+def without_collapsed(problem: Problem, state: AdjustmentState) -> Problem:
+    """The problem without the rows at which a path has collapsed onto the camera that sees it.
+
+    Of a section that one camera alone sees, as of a false detection, any depth fits. At none the row fits whatever the
+    others say, and seems to tell the camera's place and clock without error.
+    """
+    depths = [_depths(rows, state.cameras[rows.camera], state.trajectories[rows.label]) for rows in problem.rows]
+    of_camera: dict[int, list[Floats]] = {}
+    for rows, depth in zip(problem.rows, depths, strict=True):
+        of_camera.setdefault(rows.camera, []).append(np.abs(depth[np.isfinite(depth)]))
+    least = {i: _LEAST_DEPTH * float(np.median(np.concatenate([*z, np.zeros(1)]))) for i, z in of_camera.items()}
+    parts = zip(problem.rows, depths, strict=True)
+    return replace(problem, rows=tuple(rows.using(rows.use & ~(depth < least[rows.camera])) for rows, depth in parts))
+
+
+def _depths(rows: TrackObservations, camera: CameraState, path: Trajectory) -> Floats:
+    """How far (n,) the path is before the camera at each row; NaN where it is undefined."""
+    return np.asarray(camera.pose.camera_from_world(path.at(camera.reference_time(rows.time)))[:, 2])
 
 
 def _reject_single_views(parts: list[TrackObservations], state: AdjustmentState) -> list[TrackObservations]:

@@ -257,9 +257,10 @@ class _HubAgent:
             status.state = "degraded"  # a page shows what such a status says
         needs_advice = hub.calibration is None or hub.refusal is not None or hub.calibration.refused
         behind = f"messages wait of {', '.join(shares.behind[:8])}" if shares.behind else ""
-        advice = [one.text for one in hub.guidance.advice()] if needs_advice else []
+        heard_for = now - self._began  # before that a camera that runs may not have sent a frame
+        advice = [one.text for one in hub.guidance.advice() if one.kind != "silent" or heard_for > SILENT_S]
         shared = "" if self._shard is None else self._shard.text()
-        texts = (shed, behind, status.message, shared, *advice, self._last_action)
+        texts = (shed, behind, status.message, shared, *(advice if needs_advice else ()), self._last_action)
         status.message = "; ".join(text for text in texts if text)[:_MAX_TEXT]
         return status
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import null_space
 
-from hub.bundle.adjustment import adjust, apply_step, gauge, minimise
+from hub.bundle.adjustment import adjust, apply_step, gauge, mark_inliers, minimise
 from hub.bundle.block_matrix import BlockSum, SparseCovariance
 from hub.bundle.bordered_system import BAND, BorderedSystem, PathByCameras, border_block, eliminate, solve
 from hub.bundle.covariance import constrained_step, inverse_blocks
@@ -24,7 +24,7 @@ from hub.bundle.problem import (
     TrackObservations,
     Trajectory,
 )
-from hub.bundle.residuals import residual_norms
+from hub.bundle.residuals import predict, residual_norms
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
 from hub.trajectory.splines import SplineBasis
 from protocols.geometry.types import Floats
@@ -374,6 +374,22 @@ def test_outlier_rows_are_rejected_and_inliers_used() -> None:
     for rows, is_outlier in zip(solved.rows, outlier_masks, strict=True):
         assert not rows.use[is_outlier].any()
         assert rows.use[~is_outlier].mean() > 0.95
+
+
+def test_a_row_at_which_the_path_has_collapsed_onto_its_camera_is_not_used() -> None:
+    """It fits at any pose: of a rig of walkers it told a camera's place to 5e-9 baselines, and its lag to 0 s."""
+    problem, state, _ = simulated_problem(12, labels=1, lens=False)
+    rows, camera = problem.rows[0], state.cameras[0]
+    point = state.trajectories[0].at(camera.reference_time(rows.time[7:8]))[0]
+    pose = replace(camera.pose, position=point - 1e-9 * camera.pose.rotation[2])
+    state = replace(state, cameras=(replace(camera, pose=pose), *state.cameras[1:]))
+    pixels = rows.pixels.copy()
+    pixels[7] = predict(rows, state.cameras[0], state.trajectories[0])[7]
+    problem = replace(problem, rows=(replace(rows, pixels=pixels), *problem.rows[1:]))
+    assert residual_norms(problem.rows[0], state.cameras[0], state.trajectories[0])[7] == 0.0
+    marked = mark_inliers(problem, state)
+    assert not marked.rows[0].use[7]
+    assert all(part.use.mean() > 0.95 for part in marked.rows[1:])
 
 
 def test_the_time_offset_column_is_the_velocity() -> None:

@@ -1,4 +1,4 @@
-"""A hub that is stopped ends within seconds, says so meanwhile, and keeps its last answer."""
+"""A hub that is stopped ends within seconds, says so meanwhile, and keeps its last answer; one that has just begun."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hub.live import agent
 from hub.live.live_hub import LiveHub
 from hub.live.solver import InlineSolver, SolverAnswer, SolverJob
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
-from protocols.topics import STATUS
-from tests.support.samples import eventually
+from protocols.topics import CAMERA_INFO, STATUS
+from tests.support.samples import camera_info, eventually
 from tests.support.threads import running
 
 
@@ -49,3 +49,22 @@ def test_it_waits_for_a_first_answer_longer_than_for_one_more(
     assert said[0] == ("stopping", f"waits {0 if calibrated else 1} s at most for a last answer")
     assert len(said) > 2, "until the end"
     assert said[-1] == ("stopping", "it was stopped")
+
+
+def test_a_hub_that_has_just_begun_does_not_say_that_cameras_send_no_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Restarted, it knew the cameras from their descriptions a second before their first frames."""
+    monkeypatch.setattr(agent, "_STATUS_S", 0.05)
+    monkeypatch.setattr(agent, "SILENT_S", 0.6)
+    network, said = MemoryHub(), list[str]()
+    with MemoryBus(network) as bus:
+        statuses, infos = bus.subscribe(STATUS), bus.publisher(CAMERA_INFO, "cam0")
+        infos.put(camera_info("cam0"))
+
+        def complains() -> bool:
+            said.extend(one.message.message for one in statuses.drain())  # type: ignore[attr-defined]
+            return any("cam0 sends no frames" in text for text in said)
+
+        began = time.monotonic()
+        with running(lambda stop: agent.run_hub(LiveHub(), MemoryBus(network), "hub", stop)):
+            assert eventually(complains)
+    assert time.monotonic() - began > 0.6
