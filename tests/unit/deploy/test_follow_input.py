@@ -94,6 +94,19 @@ def test_of_a_box_that_the_border_cuts_the_middle_is_uncertain(tmp_path: Path) -
     assert len(whole.foot) == 2
 
 
+def test_of_a_vehicles_box_that_the_border_cuts_the_middle_is_uncertain(tmp_path: Path) -> None:
+    """It counted as the vehicle's middle to 1.5 px: paths along the border were 5 m off at stds of 0.3 m."""
+    height = SIZE[1]
+    boxes = ((100, height - 50, 90, 50), (0, 200, 30, 60), (500, 200, 90, 60))
+    text = BOXES + "".join(f"left,0,0,{x},{y},{w},{h}\n" for x, y, w, h in boxes)
+    (message,), _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "vehicle", SIZES)
+    low, left, whole = message.detections
+    assert [low.covariance[0] ** 0.5, low.covariance[2] ** 0.5 > 70.0] == [1.5, True]
+    assert [left.covariance[0] ** 0.5 > 50.0, left.covariance[2] ** 0.5] == [True, 1.5]
+    assert not whole.covariance
+    assert not low.head
+
+
 def test_boxes_beyond_the_border_are_not_cut_there(tmp_path: Path) -> None:
     text = BOXES + f"left,0,0,100,600,40,{SIZE[1] - 600}\nleft,0,0,300,-30,40,90\n"
     (message,), _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "person", SIZES)
