@@ -23,6 +23,7 @@ from protocols.session.rig import METRES_PER_UNIT
 
 if TYPE_CHECKING:
     from deploy.offline.follow.calibration import GivenCalibration
+    from hub.tracking.offline import FollowedTrack
 
 _FEET, _INCHES = 1.0 / 0.3048, 1.0 / 0.0254  # per metre, by definition
 _LENGTHS = (1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, _FEET, 1.0 / _FEET, _INCHES, 1.0 / _INCHES)
@@ -30,6 +31,7 @@ _PIXELS = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 1.5, 2.0, 3.0)
 """Ratios of the usual sizes of one film: 2160, 1440, 1080, 720, 540, 360 lines."""
 _HALVES = ((0.0, 0.5), (0.25, 0.75))
 """Of a body that is in a box, from head (0) to foot (1): boxes of upper bodies, and those of half the size."""
+_SMALLEST_M, _LARGEST_M = 0.1, 60.0  # a blackbird, a large aeroplane; in cm for m a car is 3 cm in size
 _FRAMES = 60
 """Frames that are looked at, spread over the session: some hundred people."""
 _WITHIN = 0.35
@@ -110,6 +112,27 @@ def check_units(
     ):
         return _nowhere(bodies[0], [known.calibration.cameras[name] for name in people], height)
     raise _refusal(_MISTAKES[best], bodies[best].up, known, session)
+
+
+def unlikely_size(
+    tracks: Sequence[FollowedTrack], messages: Sequence[pb.Observation], known: GivenCalibration
+) -> tuple[str, ...]:
+    """A warning where followed vehicles are of a size that none has: by their boxes and distances from the cameras."""
+    if known.calibration.scale != "metric":
+        return ()
+    boxes = {(one.camera, one.sequence): one.detections for one in messages}
+    sizes = []
+    for track in tracks:
+        place = np.median(track.position, axis=0)  # a path is short beside the factor 10 to either limit
+        for name, sequence, index in track.detections[:: 1 + len(track.detections) // _FRAMES]:
+            camera, box = known.calibration.cameras[name], boxes[name, sequence][index].box
+            if len(box) == 4:
+                distance = float(np.linalg.norm(place - camera.pose.position))
+                sizes.append(np.sqrt(box[2] * box[3]) / camera.intrinsics.focal * distance)
+    metres = METRES_PER_UNIT[known.calibration.units] * float(np.median(sizes)) if sizes else 1.0
+    if _SMALLEST_M < metres < _LARGEST_M:
+        return ()
+    return (f"what is followed is about {metres:.2g} m in size: are the calibration's positions in its units?",)
 
 
 def boxes_from_above(messages: Sequence[pb.Observation], known: GivenCalibration) -> str:

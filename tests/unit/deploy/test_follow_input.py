@@ -18,6 +18,7 @@ from deploy.offline.follow.calibration import read_given_calibration
 from deploy.offline.follow.objects import followed_detections, object_messages, read_objects
 from deploy.offline.follow.source import FollowInput, read_follow_input
 from edge.scenes.common.base import look_at_pose
+from hub.tracking.offline import FollowedTrack
 from protocols.core.errors import InputError, Refused
 from protocols.geometry.pose import POSE_CONVENTIONS, Pose
 from tests.support import crowds
@@ -105,6 +106,20 @@ def test_of_a_vehicles_box_that_the_border_cuts_the_middle_is_uncertain(tmp_path
     assert [left.covariance[0] ** 0.5 > 50.0, left.covariance[2] ** 0.5] == [True, 1.5]
     assert not whole.covariance
     assert not low.head
+
+
+@pytest.mark.parametrize(("unit", "warned"), [("m", False), ("cm", True)])
+def test_vehicles_of_a_size_that_none_has_are_warned_of(tmp_path: Path, unit: str, warned: bool) -> None:
+    """With a calibration in metres that says cm, places were 100 times as near as they are, without a word."""
+    file = write_calibration(tmp_path / "calibration.toml")
+    file.write_text(file.read_text(encoding="utf-8").replace('units = "m"', f'units = "{unit}"'), encoding="utf-8")
+    known = read_given_calibration(file)
+    text = BOXES + "left,0,0.5,400,300,90,60\n"
+    messages, _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "vehicle", SIZES)
+    one, place = np.ones(1), np.zeros((1, 3))
+    track = FollowedTrack(1, "vehicle", one, place, one, one, one > 0.0, (("left", 0, 0),))
+    warnings = units.unlikely_size([track], messages, known)
+    assert [" m in size: are the calibration's positions in its units" in text for text in warnings] == [True] * warned
 
 
 def test_boxes_beyond_the_border_are_not_cut_there(tmp_path: Path) -> None:
