@@ -122,6 +122,23 @@ def test_vehicles_of_a_size_that_none_has_are_warned_of(tmp_path: Path, unit: st
     assert [" m in size: are the calibration's positions in its units" in text for text in warnings] == [True] * warned
 
 
+@pytest.mark.parametrize("late", [0.0, 3.0, -5.0])
+def test_vehicles_that_fit_at_another_lag_are_warned_of(tmp_path: Path, late: float) -> None:
+    """Videos of another day begin at other times: tracks were made of rays to different vehicles, without a word."""
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml", offsets={NAMES[1]: late}))
+    text = BOXES
+    for frame in range(300):
+        for name, pose in poses().items():
+            for u, v in crowds.lens().project(pose.camera_from_world(np.c_[crowds.places(0.1 * frame), np.ones(3)])):
+                text += f"{name},{frame},{0.1 * frame},{u - 10},{v - 10},20,20\n"
+    messages, _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "vehicle", SIZES)
+    warnings = units.check_units(messages, known, "vehicle", tmp_path)
+    assert bool(warnings) == bool(late)
+    for text in warnings:
+        added = float(text.split(" with about ")[1].split(" s ")[0])
+        assert added == pytest.approx(-late if text.startswith(NAMES[1]) else late, abs=0.3)
+
+
 def test_boxes_beyond_the_border_are_not_cut_there(tmp_path: Path) -> None:
     text = BOXES + f"left,0,0,100,600,40,{SIZE[1] - 600}\nleft,0,0,300,-30,40,90\n"
     (message,), _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "person", SIZES)
