@@ -38,7 +38,7 @@ _SHIFTS_S = _SHIFT_S * np.arange(-75, 76)
 """Lags [s] that are tried: up to what videos that are started by hand differ by."""
 _MIN_IN_PLANE = 0.5
 """Share of one camera's boxes with one of the other's in the epipolar plane, at the best lag, that is no chance: with
-at most half of it at the given one, none of 17 simulated rigs with right offsets was warned of, 38 of 68 others were."""
+at most half of it at the given one, none of 17 simulated rigs with right offsets was warned of, 38 of 68 others."""
 _FRAMES = 60
 """Frames that are looked at, spread over the session: some hundred people."""
 _WITHIN = 0.35
