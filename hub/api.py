@@ -196,6 +196,7 @@ def calibrate(
     what cannot be read, and Refused, with reasons by camera, where the data do not determine the result for at least
     two cameras.
     """
+    from hub.calibration.exchanged_labels import exchanged_back
     from hub.calibration.pipeline import calibrate as estimate_calibration
     from hub.calibration.triangulation import meant_convention, unlikely_speed
 
@@ -232,6 +233,11 @@ def calibrate(
 
     try:
         found = estimated(session, known)
+        if not session.rig.bodies:
+            observations, exchanges = exchanged_back(found.cameras, session.observations)
+            if exchanges:
+                session = replace(session, observations=observations, warnings=(*session.warnings, *exchanges))
+                found = estimated(session, known)
     except Refused as refused:
         if known is not None:
             scale = known.scale
@@ -327,6 +333,7 @@ def triangulate(
     calibration does not know are left out with a warning. Raises InputError, and Refused where no point is seen by two
     cameras or the observations contradict the calibration.
     """
+    from hub.calibration.exchanged_labels import exchanged_back
     from hub.calibration.people.association import associate_with_calibration
     from hub.calibration.triangulation import triangulate as estimate_trajectories
 
@@ -349,7 +356,8 @@ def triangulate(
         warnings = (*warnings, f"not in the calibration, left out: {', '.join(left)}")
     used = Observations({key: track for key, track in seen.tracks.items() if key[0] in known})
     used, note = associate_with_calibration(rig, known, used)
-    warnings = (*warnings, note) if note else warnings
+    used, exchanges = exchanged_back(known, used)
+    warnings = (*warnings, *((note,) if note else ()), *exchanges)
     found = estimate_trajectories(rig, known, used, progress)
     return TriangulationResult(
         rig, found.tables, found.sigma_px, found.unused, found.unplaced, (*warnings, *found.warnings), used

@@ -65,10 +65,11 @@ def detect_format(text: str) -> str | None:
     lines = [line for line in text.splitlines()[:6] if line.strip()]
     if not lines:
         return None
-    header = [cell.strip() for cell in lines[0].split(",")]
+    parted = _delimiter(text)
+    header = [cell.strip() for cell in lines[0].split(parted)]
     if all(name in header for name in _CALISCOPE) and any(name in header for name in _CALISCOPE_POINTS):
         return "caliscope-points"
-    if {"bodyparts", "coords"} <= {line.split(",")[0].strip() for line in lines}:
+    if {"bodyparts", "coords"} <= {line.split(parted)[0].strip() for line in lines}:
         return "deeplabcut"  # its first row, scorer, is not needed
     try:
         first = [float(word) for word in lines[0].replace(",", " ").split()]
@@ -242,8 +243,17 @@ def _is_missing(*cells: str) -> bool:
     return any(cell.strip().lower() in ("", "nan") for cell in cells)
 
 
+def _delimiter(text: str) -> str:
+    """What parts the columns of a table: spreadsheets of many countries write semicolons, and decimal commas."""
+    first = text.lstrip().partition("\n")[0]
+    return ";" if first.count(";") > first.count(",") else ","
+
+
 def _table(file: Path) -> list[tuple[int, list[str]]]:
-    reader = csv.reader(io.StringIO(read_text(file)), strict=True)
+    text = read_text(file)
+    parted = _delimiter(text)
+    text = text.replace(",", ".") if parted == ";" else text
+    reader = csv.reader(io.StringIO(text), strict=True, delimiter=parted)
     out: list[tuple[int, list[str]]] = []
     try:
         for cells in reader:
@@ -283,6 +293,6 @@ def _whole(cell: str, what: str, file: Path, line: int) -> int:
 def _frame(cell: str, file: Path, line: int) -> int:
     """A frame's index, or the last number in the file name of an image."""
     numbers = re.findall(r"\d+", Path(cell.strip()).stem)
-    if not re.fullmatch(r"\s*\d+(\.0*)?\s*", cell) and numbers:
+    if not re.fullmatch(r"\s*-?\d+(\.0*)?\s*", cell) and numbers:
         return int(numbers[-1])
     return _whole(cell, "the frame", file, line)

@@ -90,7 +90,7 @@ def follow(
     from deploy.offline.follow.report import follow_report
     from deploy.offline.follow.results import REPORT, RESULT, TRACKS, result_document, result_text, tracks_text
     from deploy.offline.follow.source import read_follow_input
-    from deploy.offline.follow.units import boxes_from_above
+    from deploy.offline.follow.units import boxes_from_above, unlikely_size
     from hub.tracking.offline import follow as follow_observations
     from protocols.core.clocks import NANOSECONDS
     from protocols.session.rig import METRES_PER_UNIT
@@ -130,13 +130,15 @@ def follow(
         count = sum(len(message.detections) for message in source.observations)
         raise Refused(
             f"none of {count} detections made a track: no two cameras see a {kind} at one place for long enough; check "
-            "that the calibration is of these cameras, its time offsets, and `up`"
+            "that the calibration is of these cameras, its units, time offsets, and `up`"
             + boxes_from_above(source.observations, known),
             warnings=result.warnings,
         )
     times = [time_ns / NANOSECONDS for time_ns in source.times_ns]
     scores = None
     warnings = [*source.warnings, *result.warnings]
+    if kind == "vehicle":
+        warnings += unlikely_size(result.tracks, source.observations, known)
     if truth is not None:
         units_per_m = 1.0 / METRES_PER_UNIT[known.calibration.units]
         given = read_ground_truth(truth, source.frame_times(known))

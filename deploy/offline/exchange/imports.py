@@ -171,8 +171,8 @@ def _keypoint_observations(
         rows = [row for row in one.rows if row.score >= likelihood]
         if not several:
             # A second person in a few frames is a false detection: the better one of each frame is kept.
-            best = _best_person(rows)
-            rows = [row for row in rows if best[row.frame] == row.person]
+            better = _best_person(rows)
+            rows = [row for row in rows if better[row.frame] == row.person]
         shift = 0.5 if one.normalised else 0.0
         for row in rows:
             label = f"{row.person}.{row.joint}" if several else row.joint
@@ -180,7 +180,9 @@ def _keypoint_observations(
             columns.append((one.camera, label, row.frame, *place, _KEYPOINT_STD / max(row.score, _LEAST_SCORE)))
         stamps += times(one.camera, np.array([row.frame for row in rows], dtype=np.int64), one.file).tolist()
     if not columns:
-        raise InputError("no keypoint is above --likelihood", file=found[0].file, remedy="give a lower one")
+        best = max(row.score for one in found for row in one.rows)
+        what = f"no keypoint's likelihood reaches {likelihood:g}, the best is {best:.2g}"
+        raise InputError(what, file=found[0].file, remedy="import with a smaller --likelihood")
     cameras, labels, frames, across, down, spread = (list(column) for column in zip(*columns, strict=True))
     nothing = np.full(len(columns), np.nan)
     pixels = np.column_stack([np.array(across, dtype=np.float64), np.array(down, dtype=np.float64)])

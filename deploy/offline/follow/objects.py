@@ -18,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 
+from edge.detectors.base import CUT_VEHICLE_STD
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.ranges import MAX_PIXEL
@@ -354,16 +355,19 @@ def complete_detections(messages: Iterable[pb.Observation], kind: Kind, sizes: M
 
 def _complete(one: pb.Detection, kind: Kind, clip: tuple[int, int] | None) -> None:
     one.kind = kind
-    if kind == "person" and len(one.box) == 4 and not (one.head or one.foot):
+    if len(one.box) == 4 and not (one.head or one.foot):
         x, y, width, height = one.box
         above, below = clip is not None and y <= 0.5, clip is not None and y + height >= clip[1] - 1.5
         across = clip is not None and (x <= 0.5 or x + width >= clip[0] - 1.5)
-        if not (across or above):
-            one.head.extend([x + 0.5 * width, y])
-        if not (across or below):
-            one.foot.extend([x + 0.5 * width, y + height])
+        u_std, v_std = CUT_VEHICLE_STD * height, CUT_VEHICLE_STD * width
+        if kind == "person":
+            u_std, v_std = _CUT_ACROSS * height, _CUT_ALONG * height
+            if not (across or above):
+                one.head.extend([x + 0.5 * width, y])
+            if not (across or below):
+                one.foot.extend([x + 0.5 * width, y + height])
         if (across or above or below) and not one.covariance:
-            u_std, v_std = across * _CUT_ACROSS * height, (above or below) * _CUT_ALONG * height
+            u_std, v_std = across * u_std, (above or below) * v_std
             one.covariance.extend([_STD_PX**2 + u_std**2, 0.0, _STD_PX**2 + v_std**2])
     if one.size <= 0.0 and one.head and one.foot:
         one.size = math.dist(one.head, one.foot)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.detectors.base import Detection, Prediction
+from edge.detectors.base import CUT_VEHICLE_STD, Detection, Prediction
 from edge.detectors.moving.association import match_predictions
 from edge.detectors.moving.camera_motion import ImageMotion
 from edge.detectors.moving.foreground import BackgroundSubtractor, SubtractorName
@@ -178,6 +178,8 @@ class VehicleDetector(SilhouetteDetector):
         scale = 1.0 / self._scale
         size = math.sqrt(max(w * h, 1.0)) * scale
         std = math.hypot(_POSITION_STD * size, _FLOOR_STD)
+        u_std = max(std, CUT_VEHICLE_STD * h * scale) if x <= 0 or x + w >= image.shape[1] else std
+        v_std = max(std, CUT_VEHICLE_STD * w * scale) if y <= 0 or y + h >= image.shape[0] else std
         rows = slice(max(int(y), 0), max(int(y + h) + 1, 0))
         columns = slice(max(int(x), 0), max(int(x + w) + 1, 0))
         part, mask = image[rows, columns], foreground[rows, columns]
@@ -192,7 +194,7 @@ class VehicleDetector(SilhouetteDetector):
             score=0.9 if one.confirmed and one.moved else 0.4,
             label=one.name,
             colour=colour,
-            covariance=(std**2, 0.0, std**2),
+            covariance=(u_std**2, 0.0, v_std**2),
             kind="vehicle",
             box=(x * scale, y * scale, w * scale, h * scale),
         )

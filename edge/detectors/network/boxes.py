@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from edge.detectors.base import Detection
+from edge.detectors.base import CUT_VEHICLE_STD, Detection
 from protocols.core.clocks import NANOSECONDS
 from protocols.geometry.types import Image
 
@@ -112,7 +112,9 @@ def _detection(
     kind: Literal["person", "vehicle", "marker"] = KINDS.get(box.label) or "marker"
     across, above, below = _cut(box, size)
     std = [max(box_std * side, _MIN_STD_PX) for side in (box.width, box.height)]
-    u_std, v_std = std[0] * (_CUT_STD if across else 1.0), std[1] * (_CUT_STD if above or below else 1.0)
+    cut = [CUT_VEHICLE_STD * side if kind == "vehicle" else 0.0 for side in (box.height, box.width)]
+    u_std = max(_CUT_STD * std[0], cut[0]) if across else std[0]
+    v_std = max(_CUT_STD * std[1], cut[1]) if above or below else std[1]
     centre = box.left + 0.5 * box.width - 0.5, box.top + 0.5 * box.height - 0.5  # pixel centres are whole numbers
     head = foot = None
     middle = centre[0], box.top + _MIDDLE.get(kind, 0.5) * box.height - 0.5

@@ -438,9 +438,13 @@ def describe_timing(name: str, prepared: PreparedSession, pairs: list[PairSoluti
 
 
 def describe_failures(name: str, pairs: list[PairSolution]) -> str:
-    """Why a camera's pairs are not solved."""
-    tried = (f"with {p.b if p.a == name else p.a}: {p.status}" for p in pairs if name in (p.a, p.b) and not p.solved)
-    return "; ".join(tried) or "no other camera to compare with"
+    """Why a camera's pairs are not solved, each reason once."""
+    tried: dict[str, list[str]] = {}
+    for pair in pairs:
+        if name in (pair.a, pair.b) and not pair.solved:
+            tried.setdefault(pair.status, []).append(pair.b if pair.a == name else pair.a)
+    found = (f"with {', '.join(others)}: {status}" for status, others in tried.items())
+    return "; ".join(found) or "no other camera to compare with"
 
 
 def pair_lag(prepared: PreparedSession, pair: PairSolution, fit: PairFit) -> float:

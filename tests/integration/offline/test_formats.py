@@ -374,6 +374,18 @@ def test_deeplabcuts_likely_points_become_labels_at_the_frames_times(tmp_path: P
     ]
 
 
+def test_deeplabcuts_tables_with_semicolons_decimal_commas_and_negative_frames_are_read_alike(tmp_path: Path) -> None:
+    written = []
+    for name, text in (("a", DEEPLABCUT), ("b", DEEPLABCUT.replace(",", ";").replace(".", ","))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "left.csv").write_text(text.replace("\n0", "\n-2"))
+        out = tmp_path / f"{name}.csv"
+        assert run(["import", str(tmp_path / name / "left.csv"), "--fps", "50", "--out", str(out)]) == 0
+        written.append(out.read_text())
+    assert written[0] == written[1]
+    assert written[0].splitlines()[1].startswith("left,-2,-0.04")
+
+
 def test_mvus_files_hold_x_y_frame_one_a_camera(tmp_path: Path) -> None:
     folder = tmp_path / "detections"
     folder.mkdir()

@@ -264,6 +264,14 @@ def test_mediapipes_shares_of_the_image_become_pixels(tmp_path: Path) -> None:
     assert read_observations(out, ["cam1"]).tracks["cam1", "nose"].pixels[0] == pytest.approx([319.5, 119.5])
 
 
+def test_of_keypoints_that_are_all_unlikely_the_best_is_given(tmp_path: Path, capsys: Capture) -> None:
+    frames = [{"frame": k, "landmarks": [{"x": 0.5, "y": 0.25, "visibility": 0.1 * k}] * 33} for k in range(4)]
+    file = written(tmp_path / "cam1.json", frames)
+    arguments = ["import", str(file), "--fps", "30", "--size", "640x480", "--out", str(tmp_path / "o.csv")]
+    assert run(arguments) == 2
+    assert "no keypoint's likelihood reaches 0.6, the best is 0.3" in capsys.readouterr().err
+
+
 def test_unknown_json_and_pickles_in_foreign_files_are_bad_input(tmp_path: Path, capsys: Capture) -> None:
     import pickle
 

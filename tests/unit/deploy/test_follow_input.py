@@ -18,6 +18,7 @@ from deploy.offline.follow.calibration import read_given_calibration
 from deploy.offline.follow.objects import followed_detections, object_messages, read_objects
 from deploy.offline.follow.source import FollowInput, read_follow_input
 from edge.scenes.common.base import look_at_pose
+from hub.tracking.offline import FollowedTrack
 from protocols.core.errors import InputError, Refused
 from protocols.geometry.pose import POSE_CONVENTIONS, Pose
 from tests.support import crowds
@@ -92,6 +93,50 @@ def test_of_a_box_that_the_border_cuts_the_middle_is_uncertain(tmp_path: Path) -
         assert one.covariance[2] ** 0.5 == 1.5
     assert not whole.covariance
     assert len(whole.foot) == 2
+
+
+def test_of_a_vehicles_box_that_the_border_cuts_the_middle_is_uncertain(tmp_path: Path) -> None:
+    """It counted as the vehicle's middle to 1.5 px: paths along the border were 5 m off at stds of 0.3 m."""
+    height = SIZE[1]
+    boxes = ((100, height - 50, 90, 50), (0, 200, 30, 60), (500, 200, 90, 60))
+    text = BOXES + "".join(f"left,0,0,{x},{y},{w},{h}\n" for x, y, w, h in boxes)
+    (message,), _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "vehicle", SIZES)
+    low, left, whole = message.detections
+    assert [low.covariance[0] ** 0.5, low.covariance[2] ** 0.5 > 70.0] == [1.5, True]
+    assert [left.covariance[0] ** 0.5 > 50.0, left.covariance[2] ** 0.5] == [True, 1.5]
+    assert not whole.covariance
+    assert not low.head
+
+
+@pytest.mark.parametrize(("unit", "warned"), [("m", False), ("cm", True)])
+def test_vehicles_of_a_size_that_none_has_are_warned_of(tmp_path: Path, unit: str, warned: bool) -> None:
+    """With a calibration in metres that says cm, places were 100 times as near as they are, without a word."""
+    file = write_calibration(tmp_path / "calibration.toml")
+    file.write_text(file.read_text(encoding="utf-8").replace('units = "m"', f'units = "{unit}"'), encoding="utf-8")
+    known = read_given_calibration(file)
+    text = BOXES + "left,0,0.5,400,300,90,60\n"
+    messages, _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "vehicle", SIZES)
+    one, place = np.ones(1), np.zeros((1, 3))
+    track = FollowedTrack(1, "vehicle", one, place, one, one, one > 0.0, (("left", 0, 0),))
+    warnings = units.unlikely_size([track], messages, known)
+    assert [" m in size: are the calibration's positions in its units" in text for text in warnings] == [True] * warned
+
+
+@pytest.mark.parametrize("late", [0.0, 3.0, -5.0])
+def test_vehicles_that_fit_at_another_lag_are_warned_of(tmp_path: Path, late: float) -> None:
+    """Videos of another day begin at other times: tracks were made of rays to different vehicles, without a word."""
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml", offsets={NAMES[1]: late}))
+    text = BOXES
+    for frame in range(300):
+        for name, pose in poses().items():
+            for u, v in crowds.lens().project(pose.camera_from_world(np.c_[crowds.places(0.1 * frame), np.ones(3)])):
+                text += f"{name},{frame},{0.1 * frame},{u - 10},{v - 10},20,20\n"
+    messages, _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "vehicle", SIZES)
+    warnings = units.check_units(messages, known, "vehicle", tmp_path)
+    assert bool(warnings) == bool(late)
+    for text in warnings:
+        added = float(text.split(" with about ")[1].split(" s ")[0])
+        assert added == pytest.approx(-late if text.startswith(NAMES[1]) else late, abs=0.3)
 
 
 def test_boxes_beyond_the_border_are_not_cut_there(tmp_path: Path) -> None:

@@ -12,9 +12,11 @@ import pytest
 
 from hub.bundle import initialisation
 from hub.calibration import acceptance as calibrating
+from hub.calibration.pairs.pair_network import describe_failures
 from hub.calibration.pipeline import calibrate
 from hub.calibration.solvers import _no_pair_reason
 from hub.calibration.triangulation import triangulate
+from hub.sync.hypothesis import PairSolution
 from hub.sync.pair_solver import _PairSearch, solve_pair
 from hub.sync.settings import PairSettings
 from hub.trajectory.image_tracks import SmoothTrack
@@ -258,3 +260,8 @@ def test_where_pairs_were_solved_their_cameras_reasons_are_given() -> None:
     pairs: list[Any] = [SimpleNamespace(a="cam0", b="cam1", solved=True, status="ok")]
     reason = _no_pair_reason(prepared, pairs, {"cam1": "8 % of its rows fit"})
     assert reason == "no two cameras are left whose views fit together (cam1: 8 % of its rows fit)"
+
+
+def test_a_reason_that_many_pairs_share_is_given_once() -> None:
+    pairs = [PairSolution(*names, status) for *names, status in (("a", "b", "x"), ("c", "a", "y"), ("a", "d", "x"))]
+    assert describe_failures("a", pairs) == "with b, d: x; with c: y"
