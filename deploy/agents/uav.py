@@ -164,6 +164,7 @@ def make_link(config: UavConfig) -> Link:
         allowed=(*telemetry.MESSAGE_TYPES, *camera.MESSAGE_TYPES),
         signing=signing,
         vehicle=settings.vehicle,
+        beacon=config.control.beacon,
     )
 
 

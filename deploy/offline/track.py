@@ -121,9 +121,10 @@ def read_telemetry(file: Path) -> TelemetryFile:
     Rows with NaN, empty cells, no rotation or a repeated time are discarded and counted.
     Raises InputError: file, line, what, remedy.
     """
-    if file.suffix.lower() in (".bin", ".ulg"):
+    if file.suffix.lower() in (".bin", ".ulg", ".srt"):
         remedy = "give the .tlog, or export a telemetry.csv with time,qw,qx,qy,qz[,north,east,down]"
-        raise InputError(f"{file.suffix} telemetry can't be read by this version", file=file, remedy=remedy)
+        why = ": subtitles have no attitude" if file.suffix.lower() == ".srt" else ""
+        raise InputError(f"{file.suffix} telemetry can't be read by this version{why}", file=file, remedy=remedy)
     cells = read_csv_table(file, "telemetry", ("time", *_QUATERNION), (*_POSITION, *_GEODETIC))
     position = _POSITION if cells.columns.keys() >= set(_POSITION) else ()
     table = np.column_stack([cells.numbers_or_gaps(name) for name in ("time", *_QUATERNION, *position)])

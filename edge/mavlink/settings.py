@@ -20,7 +20,8 @@ class GuidanceLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     commanded angles. coast_s: longest time without a detection of the target. std_m: largest position std of the
     target. range_m: largest distance from where it was selected. speed: largest speed that is sent [m/s].
     fence_m: largest distance of vehicle and target from where the vehicle took off; height_m: least and greatest
-    height above there of a vehicle that follows; beyond them it has to be armed again.
+    height above there of a vehicle that follows; beyond them it has to be armed again. beacon: system id of
+    FOLLOW_TARGET, not the vehicle's: ArduPilot ignores its own, and takes FOLL_SYSID's alone if that is set.
     """
 
     gimbal: bool = False
@@ -33,6 +34,7 @@ class GuidanceLimits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     speed: Annotated[float, Meta(gt=0.0, le=50.0)] = 20.0
     fence_m: Annotated[float, Meta(gt=0.0, le=10_000.0)] = 500.0
     height_m: tuple[Metres, Metres] = (5.0, 120.0)
+    beacon: Annotated[int, Meta(ge=1, le=255)] = 200
 
     def __post_init__(self) -> None:
         if not self.height_m[0] < self.height_m[1]:

@@ -1,7 +1,7 @@
 """Any target in any view: cars, boats, bicycles and people in oblique video, also while the camera looks away.
 
     python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique]
-        [--first-seed 0] [--ranges 1,2.5,4] [--screens 0] [--covered] [--first-start 0] [--mirrored 0.6]
+        [--first-seed 0] [--ranges 1,2.5,4] [--screens 0] [--covered] [--group] [--first-start 0] [--mirrored 0.6]
         [--light dusk] [--copies 1] [--stabilisation] [--json]
 
 Rendered oblique flights with truth, and where the data folder has them real ones: whole sequences, and windows that pan
@@ -124,12 +124,15 @@ def flight(
     range_factor: float = 1.0,
     screens: int = 0,
     covered: bool = False,
+    group: bool = False,
 ) -> Sequence:
     """One rendered flight as a sequence; see ``ObliqueWorld``. covered: marked as it goes behind a screen."""
     seconds = 2.5 + 1.2 + away_s + 2.5 if path == "away" else 8.0
     count = round(seconds * rate) if frames is None else frames
     far = range_factor
-    world = ObliqueWorld(target, path, seed, (640, 360), rate, count, away_s, range_factor=far, screens=screens)
+    world = ObliqueWorld(
+        target, path, seed, (640, 360), rate, count, away_s, range_factor=far, screens=screens, group=group
+    )
     pairs = [world.rendered(i) for i in range(count)]
     box = np.array([(t.box.x, t.box.y, t.box.width, t.box.height) for _, t in pairs])
     visible = np.array([t.visible for _, t in pairs])
@@ -143,15 +146,15 @@ def flight(
 
 
 def rendered(
-    seeds: range, ranges: list[float], kinds: list[str], screens: int = 0, covered: bool = False
+    seeds: range, ranges: list[float], kinds: list[str], screens: int = 0, covered: bool = False, group: bool = False
 ) -> Iterator[Sequence]:
     """Rendered flights: every target, every flight, at 10 to 30 frames a second, the factors of the range in turn."""
     paths = [path for path in FLIGHTS if not kinds or ("rendered away" if path == "away" else "rendered") in kinds]
     for seed in seeds:
         for k, target in enumerate(TARGETS):
-            for path in paths:
+            for path in paths if not group or target in ("bicycle", "person") else ():
                 rate, away_s, factor = (of[(seed + k) % len(of)] for of in (_RATES, AWAY_S, ranges))
-                sequence = flight(target, path, 10 * seed + k, rate, away_s, None, factor, screens, covered)
+                sequence = flight(target, path, 10 * seed + k, rate, away_s, None, factor, screens, covered, group)
                 least, most = _COVERED if covered else (0.99, 2.0)
                 # One that is behind a house all the time cannot be marked: its first box shows the house.
                 if sequence.box[0, 2:].min() >= _LEAST_PX and least <= sequence.visible[0] < most:
@@ -257,6 +260,7 @@ def main() -> None:
     parser.add_argument("--ranges", default="1", help="of rendered flights, over the usual range: 4 makes a car 12 px")
     parser.add_argument("--screens", type=int, default=0, help="trees and poles before the target, rendered flights")
     parser.add_argument("--covered", action="store_true", help="mark the target as it goes behind one of them")
+    parser.add_argument("--group", action="store_true", help="bicycles and people in a group with other paint")
     parser.add_argument("--first-start", type=int, default=0, help="first frame of the first window of oblique clips")
     parser.add_argument("--mirrored", type=float, help="windows of the mirrored clips, reduced to this share: 0.6")
     parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
@@ -281,7 +285,7 @@ def main() -> None:
     if not kinds or any(kind.startswith("rendered") for kind in kinds):
         seeds = range(options.first_seed, options.first_seed + options.seeds)
         ranges = [float(factor) for factor in options.ranges.split(",")]
-        sources.append(rendered(seeds, ranges, kinds, options.screens, options.covered))
+        sources.append(rendered(seeds, ranges, kinds, options.screens, options.covered, options.group))
     if not kinds or any(not kind.startswith("rendered") for kind in kinds):
         windows = not kinds or any("away" in kind for kind in kinds)
         sources.append(real(options.data, windows, options.first_start, options.mirrored))

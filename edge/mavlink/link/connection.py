@@ -56,7 +56,7 @@ class Link:
     allowed: names of the message types that are accepted. signing: rejects unsigned messages; None: no signing in
     either direction. vehicle: system id of the only accepted vehicle; None: the first autopilot whose heartbeat is
     received. transport: an open one instead of ``url``. now_ns: the host's monotonic clock; unix_s: its wall clock,
-    used only for signing.
+    used only for signing. beacon: system id that FOLLOW_TARGET is sent from.
 
     Messages of the locked vehicle and, over its address, of any other system (ground stations behind it) are accepted;
     the reader checks ``ReceivedMessage.system``. Another address or system id is followed only after the vehicle has
@@ -76,6 +76,7 @@ class Link:
         transport: Transport | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
         unix_s: Callable[[], float] = time.time,
+        beacon: int = 200,
     ) -> None:
         self._url, self._transport = url, transport
         self._allowed = frozenset(allowed)
@@ -83,11 +84,13 @@ class Link:
         self._signing = signing
         self._now_ns, self._unix_s = now_ns, unix_s
         self._codec: Any = mavlink.MAVLink(None, system or vehicle or _DEFAULT_SYSTEM, component)
+        self._beacon: Any = mavlink.MAVLink(None, beacon, component)  # with a sequence of its own
         self._as_vehicle = system is None
         if signing is not None:
-            self._codec.signing.secret_key = signing.key
-            self._codec.signing.link_id = signing.link
-            self._codec.signing.sign_outgoing = True
+            for codec in (self._codec, self._beacon):
+                codec.signing.secret_key = signing.key
+                codec.signing.link_id = signing.link
+                codec.signing.sign_outgoing = True
         self._lock = threading.RLock()  # one thread receives, another sends
         self._framers: dict[Address, Framer] = {}
         self._retry_s = _MIN_RETRY_S
@@ -192,20 +195,21 @@ class Link:
     def _flush(self, now: int) -> None:
         """Send what the link has room for."""
         while self._transport is not None and (message := self._outbox.next(now)) is not None:
+            codec = self._beacon if message.get_type() == "FOLLOW_TARGET" else self._codec
             if self._signing is not None:
-                self._codec.signing.timestamp = self._signing.next_time(self._unix_s())
+                codec.signing.timestamp = self._signing.next_time(self._unix_s())
             if self._as_vehicle and self.vehicle is not None:
                 self._codec.srcSystem = self.vehicle
             if message.get_type() == "HEARTBEAT":
-                self._beat_sequences.append(self._codec.seq)
-            data = bytes(message.pack(self._codec))
+                self._beat_sequences.append(codec.seq)
+            data = bytes(message.pack(codec))
             try:
                 if not self._transport.send(data, self._reply_address or self._address):
                     return
             except OSError as error:
                 self._handle_failure(error)
                 return
-            self._codec.seq = (self._codec.seq + 1) % 256
+            codec.seq = (codec.seq + 1) % 256
             self._outbox.sent(len(data))
             self.counters["sent"] += 1
 

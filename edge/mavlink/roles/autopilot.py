@@ -208,7 +208,7 @@ class Autopilot:
             if math.isfinite(message.pitch) and math.isfinite(message.yaw):
                 self.counters["pointed"] += 1
                 self._airframe.point_gimbal(self._now, message.pitch, message.yaw, earth)
-        elif kind == "FOLLOW_TARGET":
+        elif kind == "FOLLOW_TARGET" and message.get_srcSystem() != self.system:  # as ArduPilot: not its own
             self.counters["follow_targets"] += 1
             place = self.origin.to_ned(1e-7 * message.lat, 1e-7 * message.lon, message.alt)
             self._airframe.follow_target(self._now, place, np.array(message.vel, np.float64))

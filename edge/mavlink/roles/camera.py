@@ -41,7 +41,7 @@ _TRACKING = {
     mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE: 4,
     mavlink.MAV_CMD_CAMERA_STOP_TRACKING: 0,
 }
-_CAMERA_ID = _TRACKING | {mavlink.MAV_CMD_VIDEO_START_STREAMING: 2, mavlink.MAV_CMD_VIDEO_STOP_STREAMING: 2}
+_CAMERA_ID = _TRACKING | {mavlink.MAV_CMD_VIDEO_START_STREAMING: 1, mavlink.MAV_CMD_VIDEO_STOP_STREAMING: 1}
 """Index of the parameter "Target Camera ID", by command."""
 
 

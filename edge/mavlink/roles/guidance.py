@@ -112,7 +112,7 @@ class Guidance:
         if self.armed_by is None:
             return self._disarmed
         limits = self.limits
-        reason = ""
+        reason = "beacon is the vehicle's own system id" if limits.beacon == self._link.vehicle else ""
         if not max(float(np.hypot(*position[:2])), float(np.hypot(*vehicle[:2]))) <= limits.fence_m:
             reason = f"fence: {limits.fence_m:.0f} m from take-off"
         elif not limits.height_m[0] <= -vehicle[2] <= limits.height_m[1]:
@@ -137,11 +137,13 @@ class Guidance:
     def _point(self, now_s: float, position: Floats, vehicle: Floats) -> None:
         if now_s >= self._configure_s:
             self._configure_s = now_s + _CONFIGURE_S
-            system = self._link.vehicle
+            vehicle_id, own, command = (
+                self._link.vehicle,
+                self._link.system,
+                mavlink.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE,
+            )
             self._link.send(
-                mavlink.MAVLink_command_long_message(
-                    system, AUTOPILOT, mavlink.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE, 0, system, CAMERA, -1, -1, 0, 0, 0
-                )
+                mavlink.MAVLink_command_long_message(vehicle_id, AUTOPILOT, command, 0, own, CAMERA, -1, -1, 0, 0, 0)
             )
         to_target = np.append(position, -_TARGET_HEIGHT_M) - vehicle
         horizontal = float(np.hypot(to_target[0], to_target[1]))

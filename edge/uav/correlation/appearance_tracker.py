@@ -37,6 +37,7 @@ _MEASURE_INSIDE = 0.6  # below it nothing is measured
 _OBSERVE_EVERY, _OBSERVE_DOUBTFUL_EVERY = 6, 2  # frames between two looks at what lies around, surely on target or not
 _CERTAIN = 3.0  # log likelihood ratio of clear evidence for the target
 _COLOUR_SHARE = 0.5  # of its log likelihood ratio that the similarity and the filter, which see it too, do not have
+_LOOK_ALIKE = 0.05  # probability that what is seen off the target is one of its kind
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
 _MOVED = 2.0  # distance within which what moves is looked for, in target lengths
 _SLIP_STD = 0.35  # of a box that has slipped off its target, in target lengths: the two still overlap
@@ -275,8 +276,12 @@ class AppearanceTracker:
         """The target about a box: where, its similarity, the log likelihood ratio by it, filter, colour; the answer."""
         box, answer = self._respond(image, box)
         score = self._memory.score(image, box)
-        colour = _COLOUR_SHARE * self._colour.log_ratio(image, box)
-        return box, score, self._memory.tracking_ratio(score) + answer.log_ratio + colour, answer
+        ratio = self._memory.tracking_ratio(score) + answer.log_ratio
+        ratio += _COLOUR_SHARE * self._colour.log_ratio(image, box)
+        # One of its kind that passes before it scores as it does and is answered by the filter, but for its colour.
+        paint = self._colour.log_ratio(image, box, in_any_light=True)
+        ratio = -float(np.logaddexp(np.log1p(-_LOOK_ALIKE) - ratio, np.log(_LOOK_ALIKE) - paint))
+        return box, score, ratio, answer
 
     def _accept(self, image: Image, box: OrientedBox, score: float, dt: float, stood: Floats | None) -> None:
         self._missed, self._unseen_s = 0, 0.0
@@ -314,11 +319,14 @@ class AppearanceTracker:
         return moved, answer
 
     def _learn(self, image: Image, box: OrientedBox, score: float) -> None:
+        agrees = self._colour.log_ratio(image, box, in_any_light=True) > 0.0
+        self._colour.learn(image, box)
+        if not agrees:
+            return  # what is seen may be one that passes before it
         if self._frame % 2:
             self._filter.learn(image, box, self._memory.agrees(float(self._memory.first_scores(image, [box])[0])))
         else:
             self._scale.learn(image, box)
-        self._colour.learn(image, box)
         if self._frame % _OBSERVE_EVERY == 0:
             self._memory.add(image, box)
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from edge.uav.base import Box
-from protocols.geometry.types import Floats, Image
+from protocols.geometry.types import Floats, Image, Ints
 
 _MAX_SHRINK = 2.0  # by linear interpolation alone; beyond, pixels are averaged first, against aliasing
 
@@ -80,25 +80,27 @@ def crop(image: Image, box: OrientedBox, size: tuple[int, int]) -> Image:
     """The pixels of a box, resampled to ``size`` (width, height) [px]; beyond the image its border is repeated."""
     factor = np.array([box.width / size[0], box.height / size[1]])
     axes, centre = box.axes, box.centre
-    shrink = int(factor.max()) if factor.max() > _MAX_SHRINK else 1
-    if shrink > 1:
+    linear = axes * factor
+    if factor.max() > _MAX_SHRINK:
+        # Along each axis by its own factor: a person is some four times as high as wide.
+        shrink = np.maximum(np.square(axes) @ factor, 1.0).astype(int)
         image, low = _averaged(image, box, shrink)
         centre = (centre - low + 0.5) / shrink - 0.5
-        factor = factor / shrink
-    linear = axes * factor
+        linear = linear / shrink[:, None]
     matrix = np.column_stack([linear, centre - linear @ (0.5 * (np.array(size) - 1.0))])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(image, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _averaged(image: Image, box: OrientedBox, shrink: int) -> tuple[Image, Floats]:
-    """The part of the image about a box, reduced by an integer, and its first pixel (2,)."""
+def _averaged(image: Image, box: OrientedBox, shrink: Ints) -> tuple[Image, Floats]:
+    """The part of the image about a box, reduced by integers (2,) along x and y, and its first pixel (2,)."""
     rows, columns = image.shape[:2]
     half = 0.5 * box.extent + 2 * shrink
     limit = np.array([columns, rows]) - shrink
     low = np.clip(np.floor(box.centre - half), 0, np.maximum(limit, 0)).astype(int)
     high = np.clip(np.ceil(box.centre + half), low + shrink, [columns, rows]).astype(int)
     cells = np.maximum((high - low) // shrink, 1)
-    part = image[low[1] : low[1] + cells[1] * shrink, low[0] : low[0] + cells[0] * shrink]
+    end = low + cells * shrink
+    part = image[low[1] : end[1], low[0] : end[0]]
     small = cv2.resize(part, (int(cells[0]), int(cells[1])), interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8), low.astype(np.float64)

@@ -311,6 +311,17 @@ def test_telemetry_on_another_clock_or_in_other_units_is_named(
     assert warning in printed
 
 
+def test_the_subtitles_of_a_drone_are_said_to_have_no_attitude(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They were asked for a first line with time,qw,qx,qy,qz."""
+    subtitles = tmp_path / "DJI_0001.SRT"
+    subtitles.write_text("1\n00:00:00,000 --> 00:00:00,033\n[latitude: 47.4] [longitude: 8.5] [rel_alt: 60.0]\n\n")
+    out = ["--target", TARGET, "--out", str(tmp_path / "out"), "--telemetry", str(subtitles)]
+    assert run(["track", str(recording / "pictures"), *out, "--rig", str(recording / "rig.toml")]) == 2
+    assert ".SRT telemetry can't be read by this version: subtitles have no attitude" in capsys.readouterr().err
+
+
 def test_good_positions_of_a_flat_view_are_not_said_to_be_in_other_units(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

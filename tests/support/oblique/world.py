@@ -46,6 +46,7 @@ class ObliqueWorld:
     target: of ``TARGETS``; flight: of ``FLIGHTS``; frames: number; away_s: how long ``away`` looks elsewhere.
     quality: of the JPEG compression. range_factor: of the camera's distance; 5 makes a car some 12 px long.
     screens: number of trees and poles that stand between the camera and the target's path. speed_factor: of its speed.
+    group: the other traffic goes along with the target, within 2.3 m of it along each axis.
     """
 
     target: str
@@ -59,6 +60,7 @@ class ObliqueWorld:
     range_factor: float = 1.0
     screens: int = 0
     speed_factor: float = 1.0
+    group: bool = False
 
     def __post_init__(self) -> None:
         if self.target not in TARGETS or self.flight not in FLIGHTS:
@@ -239,6 +241,10 @@ class ObliqueWorld:
         things = [(body, spot, turned, 0) for body, spot, turned in self._surroundings]
         for k, start, turned, other in self._traffic:
             at = start + 0.8 * _SPEEDS[self.target] * t * np.array([np.cos(turned), np.sin(turned)])
+            if self.group:
+                beside = np.random.default_rng([self.seed, 9, k]).uniform(-1.6, 1.6, 2)
+                at = place[i] + beside + 0.7 * np.array([np.sin(0.7 * t + k), np.cos(0.5 * t + 2.0 * k)])
+                turned = float(course[i])
             things.append((self._body(other, t + k, turned, view), at, turned, 0))
         things.append((own, place[i], float(course[i]), 255))
         depth = [float(view.matrix[2, :2] @ spot + view.matrix[2, 3]) for _, spot, _, _ in things]

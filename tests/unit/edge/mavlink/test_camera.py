@@ -231,7 +231,8 @@ def test_a_camera_with_a_system_id_of_its_own_is_reached_by_it() -> None:
         (mavlink.MAV_CMD_CAMERA_TRACK_POINT, (0.5, 0.5, 0.1)),
         (mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE, (0.1, 0.1, 0.2, 0.2)),
         (mavlink.MAV_CMD_CAMERA_STOP_TRACKING, ()),
-        (mavlink.MAV_CMD_VIDEO_START_STREAMING, (1, 0)),
+        (mavlink.MAV_CMD_VIDEO_START_STREAMING, (1,)),
+        (mavlink.MAV_CMD_VIDEO_STOP_STREAMING, (1,)),
     ],
 )
 def test_a_command_for_another_camera_is_not_executed(command: int, before: tuple[float, ...]) -> None:

@@ -27,9 +27,9 @@ TARGET = GuidanceTarget(0.0, np.array([30.0, 40.0]), np.array([8.0, 0.0]), 1.0, 
 class GuidanceUnderTest:
     """A control on a link, and what an autopilot hears of it."""
 
-    def __init__(self, **limits: Any) -> None:
+    def __init__(self, system: int = 1, **limits: Any) -> None:
         ours, self._pipe = Pipe.pair()
-        self._link = Link(None, system=1, component=100, allowed=("HEARTBEAT",), transport=ours, now_ns=lambda: 0)
+        self._link = Link(None, system=system, component=100, allowed=("HEARTBEAT",), transport=ours, now_ns=lambda: 0)
         vehicle = mavlink.MAVLink(None, 1, 1)
         self._pipe.send(bytes(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(vehicle)), None)
         self._link.poll()
@@ -122,6 +122,15 @@ def test_follow_target_has_the_extrapolated_position_and_a_limited_speed() -> No
     assert (north, east) == pytest.approx((34.0, 40.0), abs=0.05)  # half a second on, at 8 m/s
     assert follow_target.vel[:2] == pytest.approx([5.0, 0.0])
     assert follow_target.est_capabilities == 0b11
+    # ArduPilot, AP_Follow::should_handle_message: its own system id is nobody to follow.
+    assert follow_target.get_srcSystem() == 200
+    assert GuidanceUnderTest(follow=True, beacon=1).tick(0.5) == []
+
+
+def test_the_gimbal_is_claimed_for_the_camera_s_own_system_id() -> None:
+    claim, pointing = GuidanceUnderTest(system=7, gimbal=True).tick(0.0)
+    assert (claim.target_system, claim.param1, claim.param2) == (1, 7, 100)
+    assert (pointing.target_system, pointing.get_srcSystem()) == (1, 7)
 
 
 def test_a_stale_estimate_is_extrapolated_for_at_most_a_second() -> None:

@@ -179,7 +179,7 @@ def test_an_outline_is_cut_at_its_box_and_keeps_the_corners_beyond_it(scene: Ima
     """Without them, a lorry's outline was a triangle: turned by 90 degrees, its middle lay a quarter length off."""
     image = scene.copy()
     cv2.fillConvexPoly(image, np.array([[443, 282], [556, 282], [564, 325], [443, 317]]), (20, 20, 230))
-    image[286:314, 470:482] = scene[286:314, 470:482]  # a window: a target of one colour fills its box
+    image[286:314, 480:492] = scene[286:314, 480:492]  # a window: a target of one colour fills its box
     points = Outline(image, OrientedBox(500.0, 300.0, 116.0, 40.0)).points
     for corner in ([-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]):
         assert np.hypot(*(points - corner).T).min() < 0.12
@@ -207,6 +207,14 @@ def test_a_crop_of_a_turned_box_is_the_box_upright(scene: Image) -> None:
     turned = crop(scene, OrientedBox(600.0, 300.0, 80.0, 40.0, np.pi / 2), (80, 40))
     upright = crop(scene, OrientedBox(600.0, 300.0, 40.0, 80.0), (40, 80))
     assert np.abs(np.rot90(upright, 1).astype(int) - turned).mean() < 2.0
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi / 2])
+def test_a_crop_of_a_high_box_keeps_what_is_seen_across_it(angle: float) -> None:
+    """A person of 40 x 320 px was averaged over squares of 10 px: a quarter of the width."""
+    image = np.repeat(np.where(np.arange(640) % 16 < 8, 40, 200)[None, :], 640, axis=0).astype(np.uint8)
+    image = np.ascontiguousarray(np.repeat((image if angle == 0.0 else image.T)[..., None], 3, axis=2))
+    assert crop(image, OrientedBox(320.0, 320.0, 40.0, 320.0, angle), (32, 32)).std() > 60.0
 
 
 def test_a_target_is_predicted_while_the_camera_looks_away_and_found_again(scene: Image) -> None:

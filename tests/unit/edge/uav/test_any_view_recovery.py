@@ -456,3 +456,39 @@ def test_images_repeated_while_a_link_stalls_do_not_stop_the_target(scene: Image
         late = k in stalled and k > 29 + FPS + 1e-6
         assert found.state is (TrackState.COASTING if late else TrackState.VISIBLE), k
         assert np.hypot(found.x - place[0], found.y - place[1]) < 6.0, k
+
+
+def flat(b: int, g: int, r: int) -> Image:
+    return np.full((SIZE[1], SIZE[0], 3), (b, g, r), np.uint8)
+
+
+def test_one_look_at_another_paint_does_not_make_it_the_targets_and_a_shadow_is_no_other_paint() -> None:
+    box = OrientedBox(160.0, 120.0, *map(float, TARGET))
+    model = ColourModel(flat(60, 120, 200), box)
+    for _ in range(20):
+        model.learn(flat(60, 120, 200), box)
+    for _ in range(3):  # one passes before it
+        model.learn(flat(200, 120, 60), box)
+    assert model.log_ratio(flat(200, 120, 60), box) == -4.0
+    assert model.log_ratio(flat(200, 120, 60), box, in_any_light=True) == -4.0
+    assert model.log_ratio(flat(30, 60, 100), box) < 0.0 < model.log_ratio(flat(30, 60, 100), box, in_any_light=True)
+
+
+def test_one_of_its_kind_that_passes_before_the_target_does_not_take_it_along(scene: Image) -> None:
+    """Both are as large and alike but for their paint: the box went on with the one in front, as visible."""
+    tracker = AppearanceTracker(SIZE, FPS)
+
+    def shown(k: int) -> Image:
+        image = painted(scene, np.array([100.0 + k, 120.0]))
+        if k >= 12:
+            low = np.rint(np.array([60.0 + 3.0 * (k - 12), 122.0]) - 0.5 * TARGET).astype(int)
+            cv2.rectangle(image, low.tolist(), (low + TARGET - 1).tolist(), (40, 200, 60), -1)
+            cv2.rectangle(image, (low + 5).tolist(), (low + TARGET - 10).tolist(), (240, 240, 240), -1)
+        return image
+
+    tracker.begin(shown(0), 0.0, Box(*(np.array([100.0, 120.0]) - 0.5 * TARGET), *map(float, TARGET)))
+    for k in range(1, 70):
+        found = tracker.handle_frame(shown(k), k / FPS)
+        if found.state is TrackState.VISIBLE:
+            assert abs(found.x - 100.0 - k) < 18.0, k
+    assert found.state is TrackState.VISIBLE
