@@ -29,7 +29,7 @@ _SEVERAL_SHARE = 0.02
 
 
 def people_session(session: Path, observations: Path | None) -> RecordedSession | None:
-    """The session of a folder, if its table has several unlabelled people in one frame; else None. Raises InputError."""
+    """The session of a folder, if its table has several unlabelled people; else None. Raises InputError."""
     file = observations or next((session / n for n in (OBSERVATIONS_FILE, BOXES_FILE) if (session / n).exists()), None)
     if file is None or not file.exists() or not (session / RIG_FILE).exists():
         return None

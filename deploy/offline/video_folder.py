@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 import tomli_w
 
-from deploy.offline.progress import Progress
 from deploy.offline.people_session import read_people
+from deploy.offline.progress import Progress
 from deploy.offline.recognition import DETECTORS, Target, find_target
 from deploy.offline.single_target import rows_of_head_and_foot, rows_of_one_target, rows_of_unlabelled_people
 from edge.detectors import base as detector_base
@@ -196,8 +196,8 @@ def session_from_videos(
         metadata["target"] = target.text
     # [metadata] goes first, so that its keys do not end up in the last camera's table.
     rig_text = tomli_w.dumps({"metadata": metadata, **tables} if metadata else tables)
-    table = observations_csv(unlabelled or rows)
-    write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: table})
+    every = observations_csv(unlabelled or rows)
+    write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: every})
     if unlabelled:
         rig, people = read_people(session / OBSERVATIONS_FILE, session / RIG_FILE)
         return VideoSession(

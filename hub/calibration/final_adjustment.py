@@ -147,7 +147,7 @@ def final_adjustment(
             return reconstruction  # the camera will be left out
     rounds = 2 if warm or len(state.cameras) > LARGE_NETWORK else 4
     problem, state, _ = adjust(problem, state, rounds=rounds, progress=lambda text: report(text, 0.75))
-    if not (warm and online or shared_errors):
+    if not ((warm and online) or shared_errors):
         even = problem, state
         problem, state = _with_fewer_steps(even, _with_clock_steps(*even))
         problem, state = (problem, state) if online else _steps_or_rates(even, (problem, state))

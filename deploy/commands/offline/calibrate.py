@@ -74,9 +74,10 @@ def calibrate(
         folder of videos, otherwise the orange ball of the demo.
     detector
         For videos: what moves in them. charuco, chessboard: the board that board.toml describes. tag: ArUco or AprilTag
-        tags. bright: a point of light. marker: a coloured ball. person, with fixed cameras: one, or several of whom nobody
-        knows who is who, with measured lenses. vehicle: only one at a time in view, with fixed cameras. auto (default): looks at some frames with all of them. Or the .toml file of an ONNX network, or a
-        detector that another package registers: people, or only one target at a time in view.
+        tags. bright: a point of light. marker: a coloured ball. person, with fixed cameras: one, or with measured
+        lenses several. vehicle: only one at a time in view, with fixed cameras. auto (default): looks at some frames
+        with all of them. Or the .toml file of an ONNX network, or a detector that another package registers: people,
+        or only one target at a time in view.
     height
         For keypoints and people without labels: their (mean) height [rig units], which gives the scale; of keypoints
         by thighs and shanks (about 3 %).

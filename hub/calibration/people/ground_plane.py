@@ -1,4 +1,4 @@
-"""The ground as one camera sees it, from upright people who all have one height: single-view calibration by pedestrians.
+"""The ground as one camera sees it, from upright people of one height: single-view calibration by pedestrians.
 
 Lv, Zhao and Nevatia (2006) find focal length and horizon from heads and feet; here the lens is known, and the sizes
 of all bodies give the camera's vertical and its height above the ground in heights of a person.
@@ -83,7 +83,8 @@ def estimate_ground_plane(bodies: Bodies) -> GroundPlane | None:
     best = min(found, key=lambda one: float(one.cost))
     errors = residuals(best.x)
     spread = 1.4826 * float(np.median(np.abs(errors)))
-    information = best.jac.T @ best.jac / max(spread, 1e-3) ** 2
+    jacobian = np.asarray(best.jac)
+    information = jacobian.T @ jacobian / max(spread, 1e-3) ** 2
     stds = np.sqrt(np.diag(np.linalg.pinv(information)))
     if spread > _MAX_SPREAD or stds[:2].max() > _MAX_ANGLE_STD:
         return None

@@ -20,17 +20,17 @@ _APART = 2.0  # heights that two people are apart, at least: nearer ones say lit
 _ALIKE, _ALIKE_RELATIVE = 0.1, 0.12  # heights, and share, by which a distance may differ between two cameras
 _LEVER = 5.0  # heights at which a difference of angles counts as one of places
 _VOTE_RADIUS = 0.6  # heights
-_PEAKS = 6  # that are verified, of each lag
+_PEAKS = 6  # places in the vote that are verified, of each lag
 _MEETS = 0.35  # heights between two cameras' places of one person, who takes half of it
 _LAG_STEP_S = 0.5  # in which a walker goes half a height: twice as far as two places of one person differ
-_FINE_LAG_S = 0.05
+_FINE_LAG_S = 0.05  # s; 7 cm of a walker's way, of which the adjustment finds the rest
 _LONGEST_SPAN_S, _STEP = 0.6, 1.0  # between frames of a camera, and heights that somebody moves in it
 _CLOSE = 0.15  # heights, std of a place from one frame's box
 _SAME_S, _SAME_PLACE = 3.0, 3.0  # s, heights within which two solutions are one
 _MIN_MEETINGS, _MIN_RATIO = 30, 1.5
 """Meetings of people, and their number over that of the best other solution. Of 21 pairs of seven real cameras with
-spoilt boxes (``python -m tests.bench.crowd --calibrate``) the 19 right ones have ratios of 2.2 and more, and the two
-pairs that hardly share a view, whose best solutions are wrong, 1.1."""
+spoilt boxes the 19 right ones have ratios of 2.2 and more, and the two pairs that hardly share a view, whose best
+solutions are wrong, 1.1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +48,8 @@ class GroundPoints:
             return index
         slot = np.floor((self.time[index] - self.time[index[0]]) / _INTERVAL_S + 1e-6)
         index = index[np.unique(slot, return_index=True)[1]]
-        return index[np.unique(np.linspace(0, len(index) - 1, min(len(index), _MOST_INSTANTS)).round().astype(int))]
+        spread = np.linspace(0, len(index) - 1, min(len(index), _MOST_INSTANTS)).round().astype(np.int64)
+        return np.asarray(index[np.unique(spread)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +152,9 @@ def _common(a: GroundPoints, b: GroundPoints, lag: float) -> list[tuple[Floats, 
     out = []
     for i, j, time in zip(index[inside].tolist(), after.tolist(), wanted[inside].tolist(), strict=True):
         span = b.time[j] - b.time[j - 1]
-        if span <= _LONGEST_SPAN_S and len(places := _between(b.places[j - 1], b.places[j], (time - b.time[j - 1]) / span)):
+        if span <= _LONGEST_SPAN_S and len(
+            places := _between(b.places[j - 1], b.places[j], (time - b.time[j - 1]) / span)
+        ):
             out.append((a.places[i], places))
     return out
 
@@ -167,9 +170,7 @@ def _between(first: Floats, second: Floats, share: float) -> Floats:
     return np.where(same[:, None], nearer + share * (other[nearest] - nearer), nearer)
 
 
-def _at_lag(
-    a: GroundPoints, b: GroundPoints, lag: float, budget: int, rng: np.random.Generator
-) -> list[Registration]:
+def _at_lag(a: GroundPoints, b: GroundPoints, lag: float, budget: int, rng: np.random.Generator) -> list[Registration]:
     """The best-voted registrations at one lag, with their meetings."""
     from scipy.spatial import cKDTree
 
@@ -182,7 +183,9 @@ def _at_lag(
         return []
     middle = np.concatenate([q for _, q in common]).mean(axis=0)
     turned = np.cos(found[:, 0]), np.sin(found[:, 0])
-    moved = np.column_stack([turned[0] * middle[0] - turned[1] * middle[1], turned[1] * middle[0] + turned[0] * middle[1]])
+    moved = np.column_stack(
+        [turned[0] * middle[0] - turned[1] * middle[1], turned[1] * middle[0] + turned[0] * middle[1]]
+    )
     votes = np.column_stack([moved + found[:, 1:], _LEVER * turned[0], _LEVER * turned[1]])
     tree = cKDTree(votes)
     count = np.asarray(tree.query_ball_point(votes, _VOTE_RADIUS, return_length=True))

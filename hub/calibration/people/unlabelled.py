@@ -70,7 +70,9 @@ def calibrate_people(
         if not camera.is_measured or camera.intrinsics is None:
             refused[name] = "no intrinsics: people of unknown size tell no focal length; run `syncline intrinsics`"
         elif (plane := estimate_ground_plane(_bodies(mine, camera.intrinsics))) is None:
-            refused[name] = "the sizes of its people tell no ground plane: it needs 40 whole people all over its picture"
+            refused[name] = (
+                "the sizes of its people tell no ground plane: it needs 40 whole people all over its picture"
+            )
         else:
             planes[name], points[name] = plane, _ground_points(mine, camera.intrinsics, plane)
     placed = _placed(rig, points, priors or {}, rng, report)
@@ -182,7 +184,7 @@ def _placed(
 def _grow(first: str, edges: Mapping[tuple[str, str], Registration]) -> dict[str, Registration]:
     """All cameras that are connected with one, over the pairs with most meetings first."""
     placed = {first: Registration(0.0, np.zeros(2), 0.0, 0)}
-    both = edges | {(b, a): one.inverse() for (a, b), one in edges.items()}
+    both = {**edges, **{(b, a): one.inverse() for (a, b), one in edges.items()}}
     while more := [pair for pair in both if pair[0] in placed and pair[1] not in placed]:
         a, b = max(more, key=lambda pair: both[pair].meetings)
         placed[b] = both[a, b].after(placed[a])
@@ -230,7 +232,9 @@ def _labelled(rig: Rig, messages: Sequence[pb.Observation], initial: dict[str, C
                 pixels.append(pixel)
                 stds.append(_END_STD * float(np.linalg.norm(ends[1] - ends[0])))
     if not labels:
-        raise Refused("nobody can be followed from one camera to another", dict.fromkeys(rig.cameras, "nobody to follow"))
+        raise Refused(
+            "nobody can be followed from one camera to another", dict.fromkeys(rig.cameras, "nobody to follow")
+        )
     return gather_tracks(
         names,
         labels,

@@ -1,4 +1,4 @@
-"""People whom nobody has told apart: the ground by their sizes, cameras by where they stand, and the whole calibration."""
+"""People whom nobody told apart: the ground by their sizes, cameras by where they stand, the whole calibration."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ def bodies(name: str, noise: float, seed: int = 0) -> Bodies:
     feet = np.column_stack([rng.uniform(-4.0, 4.0, (300, 2)), np.zeros(300)])
     tall = np.column_stack([np.zeros((300, 2)), rng.normal(crowds.HEIGHT, 0.07, 300)])
     pose = crowds.poses()[name]
-    head, foot = (crowds.lens().unproject(crowds.lens().project(pose.camera_from_world(at))) for at in (feet + tall, feet))
+    head, foot = (
+        crowds.lens().unproject(crowds.lens().project(pose.camera_from_world(at))) for at in (feet + tall, feet)
+    )
     size = foot[:, 1] - head[:, 1]
     top, bottom = head[:, 1] + noise * size * rng.normal(size=300), foot[:, 1] + noise * size * rng.normal(size=300)
     return Bodies(0.5 * (head + foot), top, bottom)
@@ -149,5 +151,3 @@ def test_people_who_are_not_the_same_are_refused() -> None:
     with pytest.raises(Refused) as refusal:
         calibrate_people(rig, messages)
     assert set(refusal.value.cameras) == set(crowds.NAMES)
-
-
