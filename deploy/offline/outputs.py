@@ -66,7 +66,8 @@ def report_refusal(
         print(f"timing of {pair.cameras[0]}–{pair.cameras[1]}: lag {pair.lag_s:+.4f} s")
     if lags:
         print(f"the lags are usable without poses: syncline sync VIDEOS --calibration {out / RESULT} --out DIR")
-    print_advice(session.rig, session.observations)
+    if not getattr(session, "people", ()):
+        print_advice(session.rig, session.observations)
 
 
 def wide_console(markup: bool = False) -> Any:

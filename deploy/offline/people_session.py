@@ -14,10 +14,11 @@ from deploy.offline.follow.objects import (
     read_objects,
 )
 from hub.api import RecordedSession
+from protocols.core.errors import Refused
 from protocols.log.read.reader import LogReader
 from protocols.log.read.session import is_log
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.detections import read_detections
+from protocols.session.csv_table import read_csv_header, read_csv_table
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, misspelt_keys, read_rig
@@ -33,11 +34,10 @@ def people_session(session: Path, observations: Path | None) -> RecordedSession 
     file = observations or next((session / n for n in (OBSERVATIONS_FILE, BOXES_FILE) if (session / n).exists()), None)
     if file is None or not file.exists() or not (session / RIG_FILE).exists():
         return None
-    rig = read_rig(session / RIG_FILE)
-    if not is_boxes_file(file) and not _are_several(file, rig):
+    if not is_boxes_file(file) and not _are_several(file):
         return None
-    rig, people = read_people(file, session / RIG_FILE)
-    return RecordedSession(rig, Observations({}), misspelt_keys(rig), session.name, people=people)
+    rig, people, warnings = read_people(file, session / RIG_FILE)
+    return RecordedSession(rig, Observations({}), (*misspelt_keys(rig), *warnings), session.name, people=people)
 
 
 def people_of_log(log: Path, read: Session) -> Session:
@@ -51,20 +51,26 @@ def people_of_log(log: Path, read: Session) -> Session:
     return RecordedSession(read.rig, read.observations, read.warnings, read.name, priors, people=tuple(people))
 
 
-def read_people(file: Path, rig_file: Path) -> tuple[Rig, tuple[pb.Observation, ...]]:
-    """The rig, and its people with head and foot, by camera and time. Raises InputError."""
+def read_people(file: Path, rig_file: Path) -> tuple[Rig, tuple[pb.Observation, ...], tuple[str, ...]]:
+    """The rig, its people with head and foot, by camera and time, and warnings. Raises InputError."""
     rig = read_rig(rig_file)
     sizes = {name: camera.size for name, camera in rig.cameras.items()}
     messages = object_messages(read_objects(file, sizes))
     complete_detections(messages, "person", sizes)
-    people, _ = followed_detections(messages, "person", sizes)
-    return rig, tuple(people)
+    people, left_out = followed_detections(messages, "person", sizes)
+    if not any(message.detections for message in people):
+        raise Refused("; ".join((f"{file}: nobody in it whose head and foot are given", *left_out.warnings)))
+    return rig, tuple(people), left_out.warnings
 
 
-def _are_several(file: Path, rig: Rig) -> bool:
+def _are_several(file: Path) -> bool:
     """Whether rows of one label are several people of one frame."""
-    rows = read_detections(file, {name: camera.size for name, camera in rig.cameras.items()})
-    if not set(rows.kind) <= {"", "person"} or not any(rows.kind):
+    if "kind" not in read_csv_header(file, "observations"):
         return False
-    each = Counter(zip(rows.camera, rows.label, rows.time.tolist(), strict=True))
+    table = read_csv_table(file, "observations", ("camera", "time", "kind"), ("label",))
+    kinds = set(table.text("kind"))
+    if not kinds <= {"", "person"} or "person" not in kinds:
+        return False
+    label = table.text("label") if "label" in table.columns else [""] * len(table)
+    each = Counter(zip(table.text("camera"), label, table.text("time"), strict=True))
     return sum(count > 1 for count in each.values()) > _SEVERAL_SHARE * len(each)

@@ -8,15 +8,13 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 from edge.offline.detections import HEADER
+from hub.calibration.people import END_STD
 
 MAX_FALSE_SHARE = 0.1
 """Of false rows beside the target's. As many as that may be among the target's own, in frames in which it is missed,
 and with 10 % outliers pair synchronisation found the lag in every run (``python -m tests.bench.pair_timing``)."""
 _CONFIRMED_ROWS = 3
 """As of a tracklet: below, a label in a gap of the target is a flicker, not the target seen again."""
-_END_STD = {"head": 0.012, "foot": 0.045}
-"""Std of a person's ends over the size: of one walker in five rendered rooms 0.009 to 0.014 of the head, and 0.04 to
-0.05 of the foot, which swings with the gait."""
 
 
 def rows_of_one_target(rows: Sequence[str]) -> tuple[tuple[str, ...], int, int]:
@@ -55,15 +53,15 @@ def rows_of_one_target(rows: Sequence[str]) -> tuple[tuple[str, ...], int, int]:
 
 
 def rows_of_unlabelled_people(videos: Iterable[Sequence[str]]) -> list[str]:
-    """All rows of several videos, without labels, where at least one has several people and all are people; else none.
+    """All rows of several videos, without labels, where two or more have several people and all are people; else none.
 
     A detector's labels are of one video: who is who in two is not known.
     """
     label, kind = (HEADER.split(",").index(name) for name in ("label", "kind"))
     given = [tuple(rows) for rows in videos]
     cells = [row for rows in given for row in csv.reader(rows)]
-    crowded = any(rows_of_one_target(rows)[2] > 1 for rows in given)
-    if not crowded or any(row[kind] != "person" for row in cells):
+    crowded = sum(rows_of_one_target(rows)[2] > 1 for rows in given)
+    if crowded < 2 or any(row[kind] != "person" for row in cells):
         return []
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows([*row[:label], "", *row[label + 1 :]] for row in cells)
@@ -79,7 +77,7 @@ def rows_of_head_and_foot(rows: Sequence[str]) -> tuple[str, ...]:
     out = io.StringIO()
     writer = csv.DictWriter(out, HEADER.split(","), lineterminator="\n")
     for row in csv.DictReader([HEADER, *rows]):
-        for end, share in _END_STD.items():
+        for end, share in END_STD.items():
             if row[f"{end}_u"]:
                 variance = (share * float(row["size"])) ** 2
                 point = {"u": row[f"{end}_u"], "v": row[f"{end}_v"], "label": f"person-{end}", "score": row["score"]}

@@ -199,7 +199,7 @@ def session_from_videos(
     every = observations_csv(unlabelled or rows)
     write_together({session / RIG_FILE: rig_text, session / OBSERVATIONS_FILE: every})
     if unlabelled:
-        rig, people = read_people(session / OBSERVATIONS_FILE, session / RIG_FILE)
+        rig, people, _ = read_people(session / OBSERVATIONS_FILE, session / RIG_FILE)
         return VideoSession(
             rig, Observations({}), tuple(warnings), folder.name, priors, tuple(lines), refusal, people=people
         )

@@ -110,8 +110,10 @@ class _Views:
                 continue
             times, rows = self.common(a, labels)
             some = np.unique(np.linspace(0, len(times) - 1, _FRAMES).astype(np.int64))
-            off = self.off_plane(a, b, labels, [row[some] for row in rows])
-            own = np.diagonal(off, axis1=1, axis2=2)
+            rows = [row[some] for row in rows]
+            own = np.column_stack(
+                [self.off_plane(a, b, (x,), [row])[:, 0, 0] for x, row in zip(labels, rows, strict=True)]
+            )
             # Of the quarter of the rows that fit best, by a normal distribution: most labels may be exchanged.
             seen = own[np.isfinite(own)]
             self.tolerance[a, b] = tolerance = _FITS * float(np.quantile(seen, 0.25)) / 0.3186 if len(seen) else 0.0
@@ -119,7 +121,8 @@ class _Views:
             least = _LEAST_SHARE * len(some)
             suspicious = np.flatnonzero((own > _FITS * tolerance).sum(axis=0) >= least).tolist()
             for i, j in combinations(suspicious, 2):
-                wrong, _ = _verdicts(off[:, [[i, i], [j, j]], [[i, j], [i, j]]], tolerance)
+                both = self.off_plane(a, b, (labels[i], labels[j]), [rows[i], rows[j]])
+                wrong, _ = _verdicts(both, tolerance)
                 if wrong.sum() >= least:
                     found[labels[i], labels[j]] = None
         return list(found)

@@ -49,7 +49,7 @@ def crowd(data: Path, spoil: float, seed: int) -> str:
         text = spoilt_boxes(data / "boxes.csv", data / "calibration.toml", spoil, seed)
         (folder / "boxes.csv").write_text(text, encoding="utf-8")
         write_rig(folder / "rig.toml", {"metadata": {"clock": "shared"}, **tables})
-        rig, people = read_people(folder / "boxes.csv", folder / "rig.toml")
+        rig, people, _ = read_people(folder / "boxes.csv", folder / "rig.toml")
     return row(rig, people, truth)
 
 
@@ -99,7 +99,7 @@ def main() -> int:
                 flush=True,
             )
     for seed in range(options.first, options.first + options.halls):
-        kind = (3 + seed % 4, 3 + seed % 6, (10.0, 5.0, 25.0)[seed % 3], 60.0, (6.0, 5.0, 8.0)[seed % 3])
+        kind = (3 + seed % 4, 3 + seed % 6, (10.0, 5.0, 30.0)[seed % 3], 60.0, (6.0, 5.0, 8.0)[seed % 3])
         words = "{} cameras, {} people, {:g} fps, {:g} s".format(*kind)
         print(f"hall {seed}, {words}: {simulated(seed, *kind)}", flush=True)
     return 0

@@ -85,7 +85,8 @@ def calibrate(
         The distance between two labels, as left_knee-left_ankle=0.41 [rig units]: gives the scale. Of several people
         it is the mean.
     seed
-        Seed of the pose nodes' random samples (--solver distributed); the other solvers use no random numbers.
+        Seed of the pose nodes' random samples (--solver distributed), and of those by which unlabelled people are
+        registered; nothing else uses random numbers.
     """
     retain_freed_memory()
     from hub.api import CalibrationOptions

@@ -16,9 +16,11 @@ from protocols.geometry.types import Floats, Ints
 _INTERVAL_S = 0.4  # between instants: in less nobody moves out of their place
 _MOST_INSTANTS = 150  # spread over the recording
 _HYPOTHESES = 20_000  # of one lag; of many lags a fifth each, which votes as clearly (seven real cameras, 21 pairs)
+_MOST_PAIRS = 400  # of people in one frame, of each camera: all of 20 people; their product is held in memory
+_MOST_LAGS, _COARSE_INSTANTS, _COARSE = 120, 40, 1_000  # lags that are tried in full, after a coarse search of more
 _APART = 2.0  # heights that two people are apart, at least: nearer ones say little of a rotation
 _ALIKE, _ALIKE_RELATIVE = 0.1, 0.12  # heights, and share, by which a distance may differ between two cameras
-_LEVER = 5.0  # heights at which a difference of angles counts as one of places
+_LEVER = 5.0  # heights at which a difference of angles counts as one of places: half across what a camera sees well
 _VOTE_RADIUS = 0.6  # heights
 _PEAKS = 6  # places in the vote that are verified, of each lag
 _MEETS = 0.35  # heights between two cameras' places of one person, who takes half of it
@@ -26,7 +28,10 @@ _LAG_STEP_S = 0.5  # in which a walker goes half a height: twice as far as two p
 _FINE_LAG_S = 0.05  # s; 7 cm of a walker's way, of which the adjustment finds the rest
 _LONGEST_SPAN_S, _STEP = 0.6, 1.0  # between frames of a camera, and heights that somebody moves in it
 _CLOSE = 0.15  # heights, std of a place from one frame's box
-_SAME_S, _SAME_PLACE = 3.0, 3.0  # s, heights within which two solutions are one
+_SHARED_REACH_S, _SHARED_STEP_S, _FAR_CLOSER = 2.0, 0.1, 1.3
+"""Lags at which cameras on a shared clock are tried, and how much closer people must be there. Right ones are 1.5 times
+closer at 0 than at 0.3 s; of cameras 0.3 and 1 s apart people are 1.7 and 3.3 times closer at their lag than at 0."""
+_SAME_S, _SAME_PLACE = 3.0, 3.0  # s, heights within which two solutions are one: four steps of a walker
 _MIN_MEETINGS, _MIN_RATIO = 30, 1.5
 """Meetings of people, and their number over that of the best other solution. Of 21 pairs of seven real cameras with
 spoilt boxes the 19 right ones have ratios of 2.2 and more, and the two pairs that hardly share a view, whose best
@@ -35,10 +40,12 @@ solutions are wrong, 1.1."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundPoints:
-    """Who stands where, by frame. time: (n,) [s], ascending, on the camera's clock. places: n arrays (k, 2)."""
+    """Who stands where, by frame. time: (n,) [s], ascending, on the camera's clock. places: n arrays (k, 2). most: of
+    the instants that are used."""
 
     time: Floats
     places: list[Floats]
+    most: int = _MOST_INSTANTS
 
     def instants(self) -> Ints:
         """Frames with two people or more, an interval apart and spread over the recording."""
@@ -48,7 +55,7 @@ class GroundPoints:
             return index
         slot = np.floor((self.time[index] - self.time[index[0]]) / _INTERVAL_S + 1e-6)
         index = index[np.unique(slot, return_index=True)[1]]
-        spread = np.linspace(0, len(index) - 1, min(len(index), _MOST_INSTANTS)).round().astype(np.int64)
+        spread = np.linspace(0, len(index) - 1, min(len(index), self.most)).round().astype(np.int64)
         return np.asarray(index[np.unique(spread)])
 
 
@@ -107,13 +114,16 @@ def register(a: GroundPoints, b: GroundPoints, lags: Floats, rng: np.random.Gene
 
     lags: that are tried. rng: picks hypotheses.
     """
+    if len(lags) > _MOST_LAGS:  # of a long recording: few instants and hypotheses tell the likely ones
+        few = replace(a, most=_COARSE_INSTANTS)
+        most = [max((one.meetings for one in _at_lag(few, b, lag, _COARSE, rng)), default=0) for lag in lags.tolist()]
+        lags = lags[np.sort(np.argsort(most, kind="stable")[-_MOST_LAGS:])]
     budget = _HYPOTHESES if len(lags) == 1 else _HYPOTHESES // 5
     solutions = [one for lag in lags.tolist() for one in _at_lag(a, b, lag, budget, rng)]
     if not solutions:
         return None
     best = _refined(a, b, max(solutions, key=lambda one: one.meetings))
-    if len(lags) > 1:
-        best = _with_fine_lag(a, b, best)
+    best = _with_fine_lag(a, b, best) if len(lags) > 1 else _off_the_shared_clock(a, b, best)
     rivals = max((one.meetings for one in solutions if not _same(one, best)), default=0)
     return replace(best, rivals=rivals)
 
@@ -126,6 +136,14 @@ def _with_fine_lag(a: GroundPoints, b: GroundPoints, found: Registration) -> Reg
         trials = [_refined(a, b, replace(found, lag=float(lag))) for lag in lags]
         found = max(trials, key=lambda one: _closeness(a, b, one))
     return found
+
+
+def _off_the_shared_clock(a: GroundPoints, b: GroundPoints, found: Registration) -> Registration:
+    """The same, or at another lag if people meet far better there than at the one lag that was tried."""
+    steps = round(_SHARED_REACH_S / _SHARED_STEP_S)
+    lags = found.lag + _SHARED_STEP_S * np.arange(-steps, steps + 1)
+    best = max((_refined(a, b, replace(found, lag=float(lag))) for lag in lags), key=lambda one: _closeness(a, b, one))
+    return best if _closeness(a, b, best) > _FAR_CLOSER * _closeness(a, b, found) else found
 
 
 def _closeness(a: GroundPoints, b: GroundPoints, found: Registration) -> float:
@@ -151,10 +169,10 @@ def _common(a: GroundPoints, b: GroundPoints, lag: float) -> list[tuple[Floats, 
     after = np.searchsorted(b.time, wanted[inside]).clip(1, len(b.time) - 1)
     out = []
     for i, j, time in zip(index[inside].tolist(), after.tolist(), wanted[inside].tolist(), strict=True):
-        span = b.time[j] - b.time[j - 1]
-        if span <= _LONGEST_SPAN_S and len(
-            places := _between(b.places[j - 1], b.places[j], (time - b.time[j - 1]) / span)
-        ):
+        span, before = b.time[j] - b.time[j - 1], time - b.time[j - 1]
+        if span > _LONGEST_SPAN_S and min(before, span - before) > _FINE_LAG_S:
+            continue
+        if len(places := _between(b.places[j - 1], b.places[j], before / span)):
             out.append((a.places[i], places))
     return out
 
@@ -206,6 +224,10 @@ def _hypotheses(p: Floats, q: Floats, most: int, rng: np.random.Generator) -> Fl
     """Angle and shift (n, 3) by two people of p (k, 2) who are as far apart as two of q (m, 2)."""
     pairs = np.argwhere(~np.eye(len(p), dtype=np.bool_))
     others = np.argwhere(np.triu(np.ones((len(q), len(q)), dtype=np.bool_), 1))
+    if len(pairs) > _MOST_PAIRS:
+        pairs = rng.permutation(pairs)[:_MOST_PAIRS]
+    if len(others) > _MOST_PAIRS:
+        others = rng.permutation(others)[:_MOST_PAIRS]
     first, second = p[pairs[:, 1]] - p[pairs[:, 0]], q[others[:, 1]] - q[others[:, 0]]
     far, other = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
     alike = np.abs(far[:, None] - other) < _ALIKE + _ALIKE_RELATIVE * other

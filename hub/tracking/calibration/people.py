@@ -26,7 +26,7 @@ _MAX_GAP_S = 0.6
 _MAX_STEP = 0.45
 """Largest displacement of a point between two frames 0.1 s apart, as a fraction of the size."""
 _COLOUR_GATE = 60.0  # root mean square of the channels: as much as other people's colours differ
-_TOUCHING_DISTANCE = 0.45
+TOUCHING_DISTANCE = 0.45
 """Silhouettes nearer than this fraction of the size may be confused: both tracklets end there."""
 _MAX_SIZE_RATIO = 1.12
 """Largest ratio of a size to its recent mean; beyond, the sample is skipped."""
@@ -196,7 +196,7 @@ class PeopleTracklets:
         sizes = np.array([_size(d) for d in people])
         if len(people) > 1:
             apart = np.linalg.norm(positions[:, None] - positions[None], axis=2) + 1e9 * np.eye(len(people))
-            touching = (apart < _TOUCHING_DISTANCE * np.maximum(sizes[:, None], sizes[None])).any(axis=1)
+            touching = (apart < TOUCHING_DISTANCE * np.maximum(sizes[:, None], sizes[None])).any(axis=1)
         else:
             touching = np.zeros(len(people), dtype=np.bool_)
         matched: set[int] = set()

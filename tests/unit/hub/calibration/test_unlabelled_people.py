@@ -8,6 +8,7 @@ import io
 import numpy as np
 import pytest
 
+from hub.calibration.people import unlabelled
 from hub.calibration.people.ground_plane import Bodies, estimate_ground_plane
 from hub.calibration.people.registration import GroundPoints, lag_grid, register, rotation
 from hub.calibration.people.unlabelled import calibrate_people
@@ -47,9 +48,14 @@ def test_sizes_of_upright_people_give_the_vertical_and_the_cameras_height(name: 
 
 
 def test_people_in_one_place_give_no_ground() -> None:
+    rng = np.random.default_rng(0)
     one = bodies("left", 0.03)
-    near = np.linalg.norm(one.centre - one.centre[0], axis=1) < 0.03
-    assert estimate_ground_plane(Bodies(one.centre[near], one.top[near], one.bottom[near])) is None
+    near = np.flatnonzero(np.linalg.norm(one.centre - one.centre[0], axis=1) < 0.05)
+    many = rng.choice(near, 300)
+    noise = 0.03 * (one.bottom - one.top)[many] * rng.normal(size=(2, 300))
+    assert (
+        estimate_ground_plane(Bodies(one.centre[many], one.top[many] + noise[0], one.bottom[many] + noise[1])) is None
+    )
 
 
 def walkers(seed: int, people: int, seconds: float, fps: float = 5.0) -> tuple[Floats, Floats]:
@@ -82,7 +88,9 @@ def test_other_people_are_no_registration() -> None:
     (time, ours), (_, others) = walkers(3, 4, 40.0), walkers(4, 4, 40.0)
     a, b = GroundPoints(time, list(ours)), GroundPoints(time, list(others))
     found = register(a, b, lag_grid(a, b, 20.0), np.random.default_rng(0))
-    assert found is None or not found.accepted
+    assert found is not None
+    assert not found.accepted
+    assert found.meetings < 1.5 * found.rivals
 
 
 def session(seconds: float, offsets: dict[str, float]) -> tuple[Rig, list[pb.Observation]]:
@@ -131,6 +139,19 @@ def test_unlabelled_people_calibrate_cameras_that_share_no_clock() -> None:
         assert camera.lag_std < 0.01
     assert {label.rpartition("-")[2] for label in observations.labels} == {"head", "foot"}
     assert found.scale == "arbitrary"
+
+
+def test_cameras_that_are_apart_on_a_shared_clock_are_refused() -> None:
+    rig, messages = session(40.0, {"left": 0.0, "right": 0.0, "back": 0.8})
+    with pytest.raises(Refused, match="share no clock"):
+        calibrate_people(Rig(rig.cameras, clock="shared"), messages)
+
+
+def test_people_who_would_lean_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, messages = session(40.0, OFFSETS)
+    monkeypatch.setattr(unlabelled, "_MAX_LEAN_DEG", 0.01)  # of what is right 0.2 to 0.7
+    with pytest.raises(Refused, match="people would lean by 0"):
+        calibrate_people(rig, messages)
 
 
 def test_a_camera_without_a_measured_lens_is_refused_by_name() -> None:
