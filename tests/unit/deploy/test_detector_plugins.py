@@ -52,7 +52,8 @@ def test_a_folder_of_videos_is_a_session_until_the_network_changes(videos: Path,
     assert all("kept from before" in line for line in again.summaries)
     network(tmp_path / "net", TWO)
     changed = session_from_videos(videos, tmp_path / "session", detector=str(file))
-    assert "a.mp4: 2 targets in it, and who is who in two videos is not known; left out" in changed.warnings
+    assert not changed.observations.tracks  # two people, and who is who in two videos is not known
+    assert {len(message.detections) for message in changed.people} == {2}
 
 
 def test_another_version_of_a_detector_detects_again(
