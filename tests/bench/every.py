@@ -45,6 +45,7 @@ BENCHES = {
         ("--sessions", "4", "--seconds", "120", "--only", "five,twenty"),
         data=True,
     ),
+    "unlabelled_people": Bench("cameras by unlabelled people", ("--seeds", "1", "--halls", "1"), data=True),
     "drone_pairs": Bench("two cameras that share 20 s of a drone, simulated", ("--sessions", "20")),
     "lasting_errors": Bench(
         "four cameras of a drone, labels' errors last for seconds", ("--sessions", "3"), ("--compare",)
