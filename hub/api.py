@@ -159,7 +159,7 @@ class TriangulationResult:
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedSession(Session):
     """A session as it was recorded. clock_priors: external clock priors (NTP, PTP) of its cameras, by name. people:
-    detections of several people whom nobody has told apart, each with head and foot, in place of observations."""
+    detections of several unlabelled people, each with head and foot, in place of observations."""
 
     clock_priors: Mapping[str, ExternalClockPrior] = field(default_factory=dict)
     people: tuple[pb.Observation, ...] = field(default=(), kw_only=True)
@@ -262,7 +262,7 @@ def _from_people(session: RecordedSession, options: CalibrationOptions, progress
     from hub.calibration.people.unlabelled import calibrate_people
 
     if options.solver != "joint" or options.from_known is not None or options.refine_lenses:
-        what = "people whom nobody has told apart go with --solver joint, without --from-known and --refine-lenses"
+        what = "unlabelled people go with --solver joint, without --from-known and --refine-lenses"
         raise InputError(what, remedy="leave these out, or label the people: one label a person in all cameras")
     began = time.process_time()
     try:

@@ -1,4 +1,4 @@
-"""Sessions of several people whom nobody has told apart: boxes, or heads and feet, without labels."""
+"""Sessions of several unlabelled people: boxes, or heads and feet."""
 
 from __future__ import annotations
 
@@ -15,15 +15,11 @@ from deploy.offline.follow.objects import (
 )
 from hub.api import RecordedSession
 from protocols.core.errors import Refused
-from protocols.log.read.reader import LogReader
-from protocols.log.read.session import is_log
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.csv_table import read_csv_header, read_csv_table
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, misspelt_keys, read_rig
-from protocols.session.session import Session
-from protocols.topics import OBSERVATION
 
 _SEVERAL_SHARE = 0.02
 """Of a camera's frames, in which there are several people: false detections beside one person are fewer."""
@@ -38,17 +34,6 @@ def people_session(session: Path, observations: Path | None) -> RecordedSession 
         return None
     rig, people, warnings = read_people(file, session / RIG_FILE)
     return RecordedSession(rig, Observations({}), (*misspelt_keys(rig), *warnings), session.name, people=people)
-
-
-def people_of_log(log: Path, read: Session) -> Session:
-    """The session of a log; with its unlabelled people where nothing else was observed in it."""
-    if read.observations.tracks or not is_log(log):
-        return read
-    messages = [logged.message for logged in LogReader(log).messages([OBSERVATION])]
-    rows = [message for message in messages if isinstance(message, pb.Observation)]
-    people, _ = followed_detections(rows, "person", {name: one.size for name, one in read.rig.cameras.items()})
-    priors = read.clock_priors if isinstance(read, RecordedSession) else {}
-    return RecordedSession(read.rig, read.observations, read.warnings, read.name, priors, people=tuple(people))
 
 
 def read_people(file: Path, rig_file: Path) -> tuple[Rig, tuple[pb.Observation, ...], tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Cameras calibrated by people whom nobody told apart.
+"""Cameras calibrated by unlabelled people.
 
     python -m tests.bench.unlabelled_people [--seeds 3] [--halls 6]
 

@@ -148,10 +148,10 @@ def _load(
         raise InputError("--marker goes with a folder of videos", remedy="leave it out for a session")
     if detector is not None:
         raise InputError("--detector goes with a folder of videos", remedy="leave it out for a session")
-    from deploy.offline.people_session import people_of_log, people_session
+    from deploy.offline.people_session import people_session
 
     people = people_session(session, observations) if session.is_dir() else None
-    return people or people_of_log(session, read_session(session, observations))
+    return people or read_session(session, observations)
 
 
 def _with_scale(read: Session, height: float | None, limb: str | None) -> Session:

@@ -1,4 +1,4 @@
-"""Calibration from people whom nobody has told apart: unlabelled boxes, or heads and feet, of several at once.
+"""Calibration from unlabelled people: boxes, or heads and feet, of several at once.
 
 Each camera finds the ground by the sizes of upright people; cameras are registered on it by where people stand; with
 these poses people are followed through all cameras, and their heads and feet are adjusted as labelled points.
@@ -79,8 +79,8 @@ def calibrate_people(
         elif (plane := estimate_ground_plane(_bodies(mine, camera.intrinsics))) is None:
             count = len(_bodies(mine, camera.intrinsics).top)
             refused[name] = (
-                f"the sizes of the people in it ({count} with head and foot) tell no ground plane: it needs upright "
-                "people, 40 times or more, all over its picture"
+                f"the sizes of the people in it ({count} with head and foot) determine no ground plane: it needs "
+                "upright people, 40 times or more, all over its picture"
             )
         else:
             planes[name], points[name] = plane, _ground_points(mine, camera.intrinsics, plane)

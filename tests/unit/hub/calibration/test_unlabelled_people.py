@@ -1,4 +1,4 @@
-"""People whom nobody told apart: the ground by their sizes, cameras by where they stand, the whole calibration."""
+"""Unlabelled people: the ground by their sizes, cameras by where they stand, the whole calibration."""
 
 from __future__ import annotations
 
