@@ -83,7 +83,7 @@ def assess_quality(
     return QualityAssessment(
         level="attention" if troubled else "good",
         headline=f"Usable with care: {solved} calibrated" if troubled else f"Good: {solved} calibrated",
-        summary="Timing and poses were estimated, but check the points marked “!” before you rely on them."
+        summary="Timing and poses were estimated, but check what is marked “!” before you rely on them."
         if troubled
         else "Timing and poses are consistent with all observations.",
         findings=tuple(findings),
