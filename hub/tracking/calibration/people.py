@@ -270,13 +270,21 @@ def cluster_by_colour(tracklets: list[tuple[str, _Tracklet]]) -> list[list[int]]
 
 
 def _concurrent(tracklets: list[tuple[str, _Tracklet]]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Which pairs of tracklets (n, n) cannot be one person: they are concurrent in one camera."""
-    camera = np.array([name for name, _ in tracklets])
-    begin = np.array([tracklet.rows[0].time_ns for _, tracklet in tracklets])
-    end = np.array([tracklet.rows[-1].time_ns for _, tracklet in tracklets])
-    out = (camera[:, None] == camera[None]) & (begin[:, None] <= end[None]) & (begin[None] <= end[:, None])
+    """Which pairs of tracklets (n, n) cannot be one person: both are in one frame of one camera.
+
+    That one begins before another ends is no proof: where a detection jumps, two tracklets may share it by turns.
+    """
+    numbers: dict[str, list[int]] = {}
+    for index, (name, _) in enumerate(tracklets):
+        numbers.setdefault(name, []).append(index)
+    out = np.zeros((len(tracklets), len(tracklets)), dtype=np.bool_)
+    for mine in numbers.values():
+        times, frame = np.unique([row.time_ns for k in mine for row in tracklets[k][1].rows], return_inverse=True)
+        seen = np.zeros((len(mine), len(times)), dtype=np.float32)
+        seen[np.repeat(np.arange(len(mine)), [len(tracklets[k][1].rows) for k in mine]), frame] = 1.0
+        out[np.ix_(mine, mine)] = seen @ seen.T > 0.0
     np.fill_diagonal(out, False)
-    return np.asarray(out)
+    return out
 
 
 def _common_seconds(tracklets: list[tuple[str, _Tracklet]], group: list[int]) -> float:
