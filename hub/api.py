@@ -159,7 +159,7 @@ class TriangulationResult:
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedSession(Session):
     """A session as it was recorded. clock_priors: external clock priors (NTP, PTP) of its cameras, by name. people:
-    detections of several unlabelled people, each with head and foot, in place of observations."""
+    detections of several unlabelled people; observations are then those of people told by colour, if any."""
 
     clock_priors: Mapping[str, ExternalClockPrior] = field(default_factory=dict)
     people: tuple[pb.Observation, ...] = field(default=(), kw_only=True)
@@ -180,11 +180,13 @@ def read_session(path: str | Path, observations: str | Path | None = None) -> Se
     reader = LogReader(path)
     messages = (logged.message for logged in reader.messages([OBSERVATION, CAMERA_INFO, RIG_INFO, STATUS]))
     try:
-        rig, found, priors, warnings = session_from_messages(messages)
+        found = session_from_messages(messages)
     except Refused as refusal:
         raise no_session(path, refusal) from None
     damage = (f"the log is damaged: {reader.damage}",) if reader.damage else ()
-    return RecordedSession(rig, found, damage + warnings, path.stem, priors)
+    return RecordedSession(
+        found.rig, found.observations, damage + found.warnings, path.stem, found.priors, people=found.people
+    )
 
 
 def calibrate(
@@ -196,10 +198,6 @@ def calibrate(
     what cannot be read, and Refused, with reasons by camera, where the data do not determine the result for at least
     two cameras.
     """
-    from hub.calibration.exchanged_labels import exchanged_back
-    from hub.calibration.pipeline import calibrate as estimate_calibration
-    from hub.calibration.triangulation import meant_convention, unlikely_speed
-
     options = options or CalibrationOptions()
     if options.solver not in get_args(Solver):
         raise InputError(f"there is no solver {options.solver!r}", remedy=f"use one of {', '.join(get_args(Solver))}")
@@ -209,8 +207,36 @@ def calibrate(
         remedy = "leave --from-known and --solver out"
         raise InputError("--refine-lenses goes with --solver joint and without --from-known", remedy=remedy)
     session = session if isinstance(session, Session) else read_session(session)
-    if isinstance(session, RecordedSession) and session.people:
+    if not isinstance(session, RecordedSession) or not session.people:
+        return _from_labels(session, options, progress)
+    if not len(session.observations) or any(bar[:2] == ("head", "foot") for bar in session.rig.scale_bars):
         return _from_people(session, options, progress)
+    found: list[CalibrationResult] = []
+    refusals: list[Refused] = []
+    # By colour first, which is ten times as fast and no less exact where it finds all cameras.
+    for way in (_from_labels, _from_people) if _suits_people(options) else (_from_labels,):
+        try:
+            found.append(way(session, options, progress))
+        except Refused as refused:
+            refusals.append(refused)
+        if found and not found[-1].refused:
+            break
+    if not found:
+        raise refusals[0]
+    return max(found, key=lambda one: len(one.cameras))
+
+
+def _suits_people(options: CalibrationOptions) -> bool:
+    """Whether unlabelled people can be calibrated by with these options."""
+    return options.solver == "joint" and options.from_known is None and not options.refine_lenses
+
+
+def _from_labels(session: Session, options: CalibrationOptions, progress: Progress | None) -> CalibrationResult:
+    """The calibration by labelled points."""
+    from hub.calibration.exchanged_labels import exchanged_back
+    from hub.calibration.pipeline import calibrate as estimate_calibration
+    from hub.calibration.triangulation import meant_convention, unlikely_speed
+
     known = None
     if options.from_known is not None:
         known, rig = _fixed(Path(options.from_known), session.rig)
@@ -261,7 +287,7 @@ def _from_people(session: RecordedSession, options: CalibrationOptions, progress
     """The calibration by unlabelled people, whose heads and feet become the session's observations."""
     from hub.calibration.people.unlabelled import calibrate_people
 
-    if options.solver != "joint" or options.from_known is not None or options.refine_lenses:
+    if not _suits_people(options):
         what = "unlabelled people go with --solver joint, without --from-known and --refine-lenses"
         raise InputError(what, remedy="leave these out, or label the people: one label a person in all cameras")
     began = time.process_time()

@@ -14,15 +14,13 @@ from deploy.offline.follow.objects import (
     read_objects,
 )
 from hub.api import RecordedSession
+from hub.clocks.observation_stream import SEVERAL_SHARE
 from protocols.core.errors import Refused
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.csv_table import read_csv_header, read_csv_table
 from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, misspelt_keys, read_rig
-
-_SEVERAL_SHARE = 0.02
-"""Of a camera's frames, in which there are several people: false detections beside one person are fewer."""
 
 
 def people_session(session: Path, observations: Path | None) -> RecordedSession | None:
@@ -58,4 +56,4 @@ def _are_several(file: Path) -> bool:
         return False
     label = table.text("label") if "label" in table.columns else [""] * len(table)
     each = Counter(zip(table.text("camera"), label, table.text("time"), strict=True))
-    return sum(count > 1 for count in each.values()) > _SEVERAL_SHARE * len(each)
+    return sum(count > 1 for count in each.values()) > SEVERAL_SHARE * len(each)

@@ -6,8 +6,8 @@ external clock priors and arrivals.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 
 from google.protobuf.message import Message
 
@@ -26,6 +26,8 @@ from protocols.session.rig import Rig
 
 LEAST_ROWS = 90
 """Detections of a marker that two cameras need to be calibrated by them: three seconds at 30 Hz."""
+SEVERAL_SHARE = 0.02
+"""Of a camera's frames, in which there are several people: false detections beside one person are fewer."""
 _PEOPLE_WINDOW_S = 600.0
 """Of a recorded log: labels by colour of more tracklets take a minute and more."""
 
@@ -108,15 +110,15 @@ class ObservationStream:
         rows = [self.marker.rows(name) for name in self.marker.cameras]
         return not self.people.cameras or sum(count >= least_rows for count in rows) >= 2
 
-    def build(self, of_marker: bool) -> tuple[Rig, Observations]:
-        """The rig and the observations of the marker, or of people. Raises Refused where there are none."""
+    def build(self, of_marker: bool, *, refusing: bool = True) -> tuple[Rig, Observations]:
+        """The rig and the observations of the marker, or of people. Raises Refused where there are none, if asked."""
         if of_marker:
             rig, observations = self.marker.build()
             return rig, self._with_rate_changes_corrected(observations)
         cameras = {name: rig_camera_from_info(self._infos[name]) for name in sorted(self._infos)}
         rig = Rig(cameras, metadata={"target": PERSON})
         observations = self.people.observations()
-        if not len(observations):
+        if refusing and not len(observations):
             raise Refused("the colours of the people are ambiguous, or no two cameras observed the same person")
         return rig, observations
 
@@ -145,30 +147,52 @@ class ObservationStream:
         return replace(observations, tracks=tracks)
 
 
-def session_from_messages(
-    messages: Iterable[Message],
-) -> tuple[Rig, Observations, dict[str, ExternalClockPrior], tuple[str, ...]]:
-    """The session that a hub would have after the messages of a log, its cameras' external clock priors, and warnings.
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedStream:
+    """The session that a hub would have after the messages of a log. priors: external ones of its cameras' clocks.
+    people: the detections of several unlabelled people; observations are then those of people told by colour, if any.
+    """
+
+    rig: Rig
+    observations: Observations
+    priors: dict[str, ExternalClockPrior]
+    people: tuple[pb.Observation, ...]
+    warnings: tuple[str, ...]
+
+
+def session_from_messages(messages: Iterable[Message]) -> RecordedStream:
+    """The session of a log's messages.
 
     Times of arrival are not used: a log of other makers holds whatever they wrote. Raises Refused where there is
     nothing to calibrate from, and InputError for rows that are no pixels of their images.
     """
-    stream = ObservationStream()
+    stream, people = ObservationStream(), list[pb.Observation]()
     for message in messages:
         if isinstance(message, pb.AgentStatus):
             stream.clock_priors.handle(message)
             continue
         if isinstance(message, pb.Observation):
             message, _ = stream.assign(message, None)
+            if any(one.kind == PERSON for one in message.detections):
+                people.append(message)
         stream.store(message)
     of_marker = stream.has_marker(LEAST_ROWS)
-    rig, observations = stream.build(of_marker)
+    people = [] if of_marker else [one for one in people if one.boot_id == stream.people.boot(one.camera)]
+    people = people if are_several(people) else []
+    rig, observations = stream.build(of_marker, refusing=not people)
     source = stream.marker if of_marker else stream.people
     priors = stream.clock_priors.for_boots({name: source.boot(name) for name in rig.cameras})
     alarms = tuple(
         f"{text}: its rows on one side of that were left out" for text in stream.clocks.alarms.values() if of_marker
     )
-    return rig, observations, priors, alarms + stream.marker.warnings + column_warnings(rig, observations)
+    warnings = alarms + stream.marker.warnings + column_warnings(rig, observations)
+    return RecordedStream(rig, observations, priors, tuple(people), warnings)
+
+
+def are_several(messages: Collection[pb.Observation]) -> bool:
+    """Whether several people are in frames at once."""
+    several = sum(sum(one.kind == PERSON for one in message.detections) > 1 for message in messages)
+    return several > SEVERAL_SHARE * len(messages)
 
 
 def without_tracked(message: pb.Observation) -> pb.Observation:

@@ -258,7 +258,8 @@ def _labelled(rig: Rig, messages: Sequence[pb.Observation], initial: dict[str, C
     times = [one.device_time_ns + lags[one.camera] for one in seen]
     followed = follow(seen, start, range(min(times), max(times) + 1, _WANTED_INTERVAL_NS), up=up)
     by_key = {(one.camera, one.sequence): one for one in seen}
-    hidden = _touching(seen, initial, followed.tracks, up)
+    of_boxes = _cameras_of_boxes(seen)
+    hidden = _touching([one for one in seen if one.camera not in of_boxes], initial, followed.tracks, up)
     names, labels, frames, moments, pixels, stds = [], [], [], [], [], []
     for track in followed.tracks:
         if len({name for name, _, _ in track.detections}) < 2 or len(track.detections) < _ROWS_OF_PERSON:
@@ -272,7 +273,7 @@ def _labelled(rig: Rig, messages: Sequence[pb.Observation], initial: dict[str, C
             if not len(body.top):
                 continue
             ends, shares = np.array([one.head, one.foot]), [END_STD["head"]]
-            if abs(ends[0, 0] - ends[1, 0]) < _ONE_COLUMN_PX:
+            if name in of_boxes:
                 ends = camera.intrinsics.project_normalised(body.ends(camera.pose.rotation @ up)[:, 0])
                 shares = [_BOX_STD, _BOX_STD]
             elif track.id in hidden.get((name, sequence), ()):
@@ -298,6 +299,15 @@ def _labelled(rig: Rig, messages: Sequence[pb.Observation], initial: dict[str, C
         stds=np.array(stds),
         order=rig.cameras,
     )
+
+
+def _cameras_of_boxes(messages: Sequence[pb.Observation]) -> set[str]:
+    """The cameras whose people are boxes: head and foot in one column, which single silhouettes have by chance."""
+    columns: dict[str, list[float]] = {}
+    for message in messages:
+        bodies = [abs(one.head[0] - one.foot[0]) for one in message.detections if one.head and one.foot]
+        columns.setdefault(message.camera, []).extend(bodies)
+    return {name for name, one in columns.items() if one and float(np.median(one)) < _ONE_COLUMN_PX}
 
 
 def _touching(

@@ -76,3 +76,20 @@ def test_people_in_a_log_become_labelled_walkers(tmp_path: Path) -> None:
     session = read_session(recorded(tmp_path / "people.mcap", content))
     assert {label.partition("-")[2] for _, label in session.observations.tracks} == {"head", "foot"}
     assert np.all([label.startswith("walker") for _, label in session.observations.tracks])
+
+
+def test_people_in_a_log_who_wear_one_colour_are_told_by_where_they_are(tmp_path: Path) -> None:
+    scene = scenes.get_people_scene(9505, 3, 3)
+    traffic = film(scene, 30.0, 9505)
+    for _, message in traffic.arrivals:
+        for one in message.detections:
+            one.colour.CopyFrom(pb.Colour(red=90, green=90, blue=90))
+    found = calibrate(
+        recorded(tmp_path / "uniform.mcap", [*traffic.infos, *(message for _, message in traffic.arrivals)])
+    )
+    assert sorted(found.cameras) == sorted(one.name for one in scene.cameras)
+    for name, camera in found.cameras.items():
+        true = scene.true_time_map(name, found.calibration.reference)
+        moment = CameraTime(camera.lag_time)
+        off = camera.time_map.reference_from_camera(moment) - true.reference_from_camera(moment)
+        assert abs(off) < 4.0 * camera.lag_std + 1e-9
