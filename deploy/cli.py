@@ -66,12 +66,12 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
     ("recover", "data.logs:recover", "Recover a damaged log."),
     ("info", "data.logs:info", "Show the contents of a log or a session."),
     ("keys", "site.keys:KEYS", "Certificates and access rules of a site."),
-    ("install", "site.install:install", "Install an agent as a systemd service."),
-    ("uninstall", "site.install:uninstall", "Remove the agents' systemd services."),
+    ("install", "site.machine:install", "Install an agent as a systemd service."),
+    ("uninstall", "site.machine:uninstall", "Remove the agents' systemd services."),
     ("site", "site.site:SITE", "Enrol, update, renew and watch all boards of a site."),
     ("fleet", "site.fleet:fleet", "Run all agents of a rig on this machine."),
-    ("bundle", "site.bundle:bundle", "Collect wheels and an install script for a board without a network."),
-    ("doctor", "site.doctor:doctor", "Diagnose this machine and its agents, with a remedy for each problem."),
+    ("bundle", "site.machine:bundle", "Collect wheels and an install script for a board without a network."),
+    ("doctor", "site.machine:doctor", "Diagnose this machine and its agents, with a remedy for each problem."),
 )
 
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory", "can't start new thread")

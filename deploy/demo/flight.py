@@ -13,14 +13,15 @@ import numpy as np
 from deploy.agents.processes import START_TIMEOUT_S, AgentProcesses, free_udp_port
 from deploy.agents.signals import interrupt_on_signals
 from deploy.config.uav import SimulatedFlightConfig
-from deploy.demo.display import ProgressDisplay
 from deploy.demo.flight_outcome import (
     LOG,
     REPORT,
     FlightOutcome,
     compare_geo_positions,
     compare_log_with_world,
+    write_report,
 )
+from deploy.demo.marker import ProgressDisplay
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
@@ -51,7 +52,6 @@ def run_town(
 
     view_port: port of a live view; None = no view, 0 = any free port.
     """
-    from deploy.demo.flight_outcome import write_report
     from edge.mavlink.roles.station import GroundStation
     from edge.uav.world.patrol import patrol_world
 

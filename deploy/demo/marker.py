@@ -1,15 +1,19 @@
-"""Processes of the marker demo: simulated cameras, a hub and a recorder, connected by a loopback router."""
+"""Processes of the marker demo: simulated cameras, a hub and a recorder, connected by a loopback router.
+
+The progress display of all demos: a live bar on a terminal, otherwise a line every few seconds.
+"""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Self
 
 from deploy.agents.processes import START_TIMEOUT_S, AgentProcesses, last_line
 from deploy.agents.signals import interrupt_on_signals
-from deploy.demo.display import ProgressDisplay
 from protocols.bus.base import Bus
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
@@ -18,8 +22,55 @@ from protocols.core.errors import Refused
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CALIBRATION, OBSERVATION
 
+if TYPE_CHECKING:
+    from rich.live import Live
+
 LOG = "demo.mcap"
 _OUTPUTS = (LOG, "calibration.toml", "trajectory.csv", "tracks.csv", "result.json", "report.html")
+_PRINT_INTERVAL_S = 5.0  # between two lines where there is no terminal to redraw
+
+
+class ProgressDisplay:
+    """Shows how far a demo of ``seconds`` has got. title: what it does. quiet: only the view's address is printed."""
+
+    def __init__(self, title: str, seconds: float, *, quiet: bool) -> None:
+        self._title, self._seconds, self._quiet = title, seconds, quiet
+        self._printed, self._status = -_PRINT_INTERVAL_S, ""
+        self._live: Live | None = None
+
+    def __enter__(self) -> Self:
+        if not self._quiet and sys.stdout.isatty():
+            from rich.console import Console
+            from rich.live import Live
+
+            self._live = Live(console=Console(), refresh_per_second=4, transient=True)
+            self._live.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.__exit__(None, None, None)
+
+    def announce(self, address: str) -> None:
+        """Print where the live view is."""
+        print(f"live view: open {address}", file=sys.stderr if self._quiet else sys.stdout, flush=True)
+
+    def show(self, elapsed: float, status: str, counts: str = "") -> None:
+        """Show the time [s] since the first frame, what happens now, and the counts so far."""
+        if self._quiet:
+            return
+        if self._live is None:
+            if elapsed - self._printed >= _PRINT_INTERVAL_S or (elapsed == 0.0 and status != self._status):
+                self._printed, self._status = elapsed, status
+                print(f"{elapsed:5.1f} s", *filter(None, (counts, status)), sep="  ", flush=True)
+            return
+        from rich.console import Group
+        from rich.progress_bar import ProgressBar
+        from rich.text import Text
+
+        bar = ProgressBar(total=self._seconds, completed=min(elapsed, self._seconds), width=60)
+        title = Text(f"{self._title} {elapsed:4.0f} of {self._seconds:.0f} s")
+        self._live.update(Group(title, bar, Text(counts), Text(status)))
 
 
 @dataclass(slots=True)

@@ -7,12 +7,11 @@ import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
 
-from edge.devices.base import Frame
+from edge.devices.playback.base import Playback
 from edge.devices.playback.video_reader import image_files
 from edge.uav.base import Basis, Box, Estimate, Telemetry, Tracker, TrackState
 from edge.uav.georeference import Georeference
@@ -48,13 +47,6 @@ _COLOURS = {TrackState.VISIBLE: (80, 220, 80), TrackState.COASTING: (40, 170, 25
 _LAYERS = {"road": (110, 80, 30), "tracks": (160, 160, 160)}
 _OTHER_LAYER = (0, 220, 220)  # BGR
 _PARTICLE = (230, 120, 230)  # BGR
-
-
-class FrameSource(Protocol):
-    """An opened recording of images."""
-
-    def read(self, timeout_s: float) -> Frame | None:
-        """The next frame; None after the last."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,7 +184,7 @@ def count_frames(video: Path) -> int:
 
 
 def track_recording(
-    recording: FrameSource,
+    recording: Playback,
     tracker: Tracker,
     target: Box,
     *,

@@ -32,7 +32,7 @@ from edge.detectors.marker.factory import ball_detector, bright_or_tag_detector
 from edge.detectors.plugins import detector_revision, is_plugin, load_detector, unknown_detector
 from edge.devices.playback.video_reader import VIDEO_SUFFIXES, VideoReader, has_pyav, is_video
 from edge.offline.detections import HEADER, VideoDetections, observations_csv, run_detector
-from edge.offline.sound import ENERGY_RATE, sound_energy
+from edge.offline.sampling import ENERGY_RATE, sound_energy
 from edge.offline.video import MARKER_FILE, detect_objects, read_marker_model
 from hub.api import RecordedSession
 from hub.clocks.sound import sound_priors

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from deploy.site import keys
-from protocols.bus.router.permission_selftest import PermissionCheck, try_agents, try_untrusted_client
+from protocols.bus.router.selftest import PermissionCheck, try_agents, try_untrusted_client
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.security.access import certificate_name
 from protocols.bus.settings import BusConfig, TlsConfig

@@ -20,7 +20,7 @@ from edge.agents.image_health import ImageHealth
 from edge.agents.publish_queue import PublishQueue
 from edge.agents.thumbnails import THUMBNAIL_WIDTH, thumbnail_message
 from edge.detectors.base import Detection, Detector, Prediction
-from edge.devices.base import Device, Frame, HasTemperature, Reconnecting
+from edge.devices.base import Device, Frame, Reconnecting
 from protocols.bus.base import Bus, Subscription, agent_status
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
@@ -268,13 +268,13 @@ class CameraAgent:
             "repeated": self._health.repeated,
             "stale": self._health.stale,
         }
-        if isinstance(self._device, Reconnecting):
-            counters["reconnections"] = self._device.reconnections
         gauges = {"fps": 0.0, "latency_s": 0.0, **self._clock.gauges(self._device.info.clock)}
         if self._exposure_ns > 0:
             gauges["exposure_s"] = self._exposure_ns / NANOSECONDS
-        if isinstance(self._device, HasTemperature) and (temperature := self._device.temperature) is not None:
-            gauges["temperature_c"] = temperature
+        if isinstance(self._device, Reconnecting):
+            counters["reconnections"] = self._device.reconnections
+            if (temperature := self._device.temperature) is not None:
+                gauges["temperature_c"] = temperature
         if out_queue.subscribed_topics is not None:
             gauges["heard"] = float(out_queue.has_subscriber(OBSERVATION))
         if gauges.get("heard") == 0.0 and not text:

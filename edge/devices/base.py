@@ -76,7 +76,7 @@ class Device(Protocol):
 
 @runtime_checkable
 class Reconnecting(Protocol):
-    """Additional properties of a device that reconnects by itself after it was unplugged."""
+    """Additional properties of a live camera, which reconnects by itself after it was unplugged."""
 
     @property
     def disconnected(self) -> bool:
@@ -85,6 +85,10 @@ class Reconnecting(Protocol):
     @property
     def reconnections(self) -> int:
         """Number of successful reconnections."""
+
+    @property
+    def temperature(self) -> float | None:
+        """[°C]; None where it is not measured."""
 
 
 class WrappedDevice:
@@ -116,7 +120,7 @@ class WrappedDevice:
     @property
     def temperature(self) -> float | None:
         """The device's temperature [°C]; None if it does not measure one."""
-        return self._device.temperature if isinstance(self._device, HasTemperature) else None
+        return self._device.temperature if isinstance(self._device, Reconnecting) else None
 
     def open(self) -> None:
         """Open the device."""
@@ -129,15 +133,6 @@ class WrappedDevice:
     def close(self) -> None:
         """Close the device."""
         self._device.close()
-
-
-@runtime_checkable
-class HasTemperature(Protocol):
-    """Additional property of a device with a temperature sensor."""
-
-    @property
-    def temperature(self) -> float | None:
-        """[°C]; None where it is not available."""
 
 
 def check_size(intrinsics: Intrinsics | None, width: int, height: int, what: str) -> None:

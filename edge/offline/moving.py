@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -20,9 +19,6 @@ from edge.devices.playback.video_writer import video_writer
 from edge.offline.detections import Collected, VideoDetections, detection_rows, run_detector
 from protocols.core.errors import Refused
 from protocols.geometry.types import Image
-
-if TYPE_CHECKING:
-    from protocols.geometry.types import Image
 
 MovingDetector = PersonDetector | VehicleDetector
 _LEARN_S, _LEARN_IMAGES = 60.0, 48  # from the beginning of a video: in a minute everybody has moved

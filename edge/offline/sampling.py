@@ -1,15 +1,20 @@
-"""Some frames of a video, spread evenly over it: for a first look at what is in it."""
+"""What a first look at a video needs: some frames, spread evenly over it, and its sound track as energy over time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
 from edge.devices.playback.video_reader import VideoReader, has_pyav, upright_image, upright_size
-from protocols.geometry.types import Image
+from protocols.geometry.types import Floats, Image
 
 _READ_WHOLE = 600  # frames: a shorter video is decoded from its beginning
+ENERGY_RATE = 500.0
+"""Samples of the energy a second: sound travels 0.7 m in one."""
+_WINDOW = 16  # samples of one energy
+_LONGEST_S = 3600.0  # s of sound: bounds what is decoded and held, 29 million samples
 
 
 def sample_images(video: VideoReader, count: int) -> Iterator[Image]:
@@ -44,3 +49,34 @@ def _seek(video: VideoReader, count: int) -> Iterator[Image]:
             if frame is not None and frame.pts != last and upright_size(frame) == video.info.size:
                 last = frame.pts
                 yield upright_image(frame)
+
+
+def sound_energy(path: Path) -> tuple[float, Floats] | None:
+    """Time of the first sample [s, as of the video's frames] and energies (n,) at ``ENERGY_RATE``, an hour at most.
+
+    None where the file has no sound, or it cannot be decoded.
+    """
+    if not has_pyav():
+        return None
+    import av
+
+    start, parts, count = None, [], 0
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.audio:
+                return None
+            mono = av.AudioResampler(format="flt", layout="mono", rate=round(_WINDOW * ENERGY_RATE))
+            for decoded in container.decode(container.streams.audio[0]):
+                start = decoded.time if start is None else start
+                for frame in mono.resample(decoded):
+                    parts.append(frame.to_ndarray()[0])
+                    count += len(parts[-1])
+                if count > _LONGEST_S * _WINDOW * ENERGY_RATE:
+                    break
+    except av.error.FFmpegError:
+        pass  # what was decoded before counts
+    samples = np.concatenate(parts) if parts else np.zeros(0, dtype=np.float32)
+    samples = samples[: len(samples) // _WINDOW * _WINDOW]
+    if start is None or not len(samples) or not np.isfinite(samples).all():
+        return None
+    return float(start), (samples.reshape(-1, _WINDOW).astype(np.float64) ** 2).mean(axis=1)

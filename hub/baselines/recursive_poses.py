@@ -217,7 +217,7 @@ def reconstruct_by_paper(
     """
     names = [name for name in prepared.camera_order if name in graph.clocks]
     pairs = _pairs(prepared, observations, graph, names)
-    initial = _initial_poses(len(names), pairs)
+    initial = _initial_poses(pairs)
     refused = {
         name: "shares too few observations with any placed camera" for i, name in enumerate(names) if i not in initial
     }
@@ -254,13 +254,13 @@ def _pairs(
             if camera == seen.camera:
                 out += [(camera, other, np.array(row)) for other, row in associator.add_own(seen)]
             else:
-                pair = associator.add_neighbour(seen)
-                if pair is not None:
-                    out.append((camera, seen.camera, np.array(pair[1])))
+                row = associator.add_neighbour(seen)
+                if row is not None:
+                    out.append((camera, seen.camera, np.array(row)))
     return out
 
 
-def _initial_poses(cameras: int, pairs: list[SharedPair]) -> dict[int, Pose]:
+def _initial_poses(pairs: list[SharedPair]) -> dict[int, Pose]:
     """Poses chained from the first camera, scaled so that the first two placed cameras are `_BASELINE` apart."""
     shared: dict[tuple[int, int], list[Floats]] = {}
     for k, other, row in pairs:

@@ -123,7 +123,7 @@ def _run(
             network.tick()
             due = max(due + UPDATE_PERIOD_S, row.time - 1.0)  # no updates across a gap
         network.observe(row)
-    network.run_until_converged(_MAX_UPDATES)
+    network.run_until_converged()
     poses, _ = network.poses()
     placed = sorted(poses)
     if len(placed) < 2:
@@ -257,24 +257,22 @@ class InProcessNetwork:
             for neighbour in self.nodes[state.camera].neighbours():
                 self._record(self.nodes[neighbour].handle(state))
 
-    def run_until_converged(self, max_updates: int) -> int:
-        """Update until no camera moves by more than 1e-7 in ten updates, at most ``max_updates`` times.
+    def run_until_converged(self) -> None:
+        """Update until no camera moves by more than 1e-7 in ten updates, at most ``_MAX_UPDATES`` times.
 
-        1e-7 rad relative to the first camera, and as a share of the largest distance from it. Returns the number of
-        updates.
+        1e-7 rad relative to the first camera, and as a share of the largest distance from it.
         """
         for node in self.nodes.values():
             node.relinearise_all()
         before = self._normalised_poses()
-        for count in range(1, max_updates + 1):
+        for count in range(1, _MAX_UPDATES + 1):
             self.tick()
             if count % 10 == 0:
                 now = self._normalised_poses()
                 complete = len(now) == len(self.nodes) or count >= _MAX_JOINING_UPDATES
                 if complete and before.shape == now.shape and float(np.abs(now - before).max(initial=0.0)) < 1e-7:
-                    return count
+                    return
                 before = now
-        return max_updates
 
     def _normalised_poses(self) -> Floats:
         """Poses (n, 12) relative to the first camera: rotations, and positions scaled to a largest distance of 1."""

@@ -25,11 +25,11 @@ _THREAD_LIMITS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 class WorkerSolver:
     """Solves jobs in one worker process, which is ended and replaced when it exceeds its budget or dies.
 
-    budget_s: CPU [s] that a job may take, or the time that it may do nothing. memory_bytes: limit of the worker's data.
+    budget_s: CPU [s] that a job may take, or the time that it may do nothing.
     """
 
-    def __init__(self, budget_s: float = _BUDGET_S, memory_bytes: int = _MEMORY_BYTES) -> None:
-        self._budget_s, self._memory_bytes = budget_s, memory_bytes
+    def __init__(self, budget_s: float = _BUDGET_S) -> None:
+        self._budget_s = budget_s
         self._pool: ProcessPoolExecutor | None = None
         self._pid: Future[int] | None = None
         self._job: tuple[int, float, Future[SolverAnswer]] | None = None
@@ -106,7 +106,7 @@ class WorkerSolver:
                 1,
                 mp_context=multiprocessing.get_context("spawn"),
                 initializer=_prepare_worker,
-                initargs=(self._memory_bytes, os.getpid()),
+                initargs=(os.getpid(),),
             )
             self._pid = self._pool.submit(os.getpid)
         return self._pool
@@ -123,12 +123,12 @@ class WorkerSolver:
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _prepare_worker(memory_bytes: int, parent: int) -> None:
+def _prepare_worker(parent: int) -> None:
     """Bound the worker's memory, let the bus go first, and end with the parent, also where that was killed."""
     with suppress(ImportError, OSError, ValueError):  # not on every system
         import resource
 
-        resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))
+        resource.setrlimit(resource.RLIMIT_DATA, (_MEMORY_BYTES, _MEMORY_BYTES))
     with suppress(OSError, AttributeError):
         os.nice(_NICENESS)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the hub, which ends its worker

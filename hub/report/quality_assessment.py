@@ -67,7 +67,7 @@ def assess_quality(
 ) -> QualityAssessment:
     """Assess a solved session."""
     findings: list[QualityFinding] = []
-    findings += _cameras(calibration, rig)
+    findings += _cameras(calibration)
     findings += _timing(calibration, rig, used)
     findings += _rates(calibration, rig)
     findings += _pixels(calibration, used)
@@ -134,7 +134,7 @@ def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
-def _cameras(calibration: Calibration, rig: Rig) -> list[QualityFinding]:
+def _cameras(calibration: Calibration) -> list[QualityFinding]:
     if not calibration.refused:
         return [QualityFinding("good", f"Every camera is connected: {_listed(list(calibration.cameras))}.")]
     return [

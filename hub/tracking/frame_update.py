@@ -19,8 +19,7 @@ from hub.tracking.association.assignment import (
 )
 from hub.tracking.association.encounters import resolve_encounters
 from hub.tracking.association.initiation import unassociated_detections
-from hub.tracking.association.marginals import marginal_probabilities
-from hub.tracking.association.scan import AMBIGUOUS, associate_jointly
+from hub.tracking.association.scan import AMBIGUOUS, associate_jointly, marginal_probabilities
 from hub.tracking.detections import FrameDetections, TrackingCamera
 from hub.tracking.filter import kalman
 from hub.tracking.filter.detection_model import (
@@ -35,16 +34,17 @@ from hub.tracking.filter.detection_model import (
 )
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import VELOCITY
-from hub.tracking.filter.manoeuvre import (
+from hub.tracking.filter.measurement import NOISE_ENTRIES, PredictedMeasurement, measurements_of, predict_measurement
+from hub.tracking.filter.prediction import (
     ManoeuvreHypothesis,
     can_manoeuvre,
     gpb1_update,
     manoeuvre_hypothesis,
+    on_floor,
+    predict_targets,
     units_of,
     within_reach,
 )
-from hub.tracking.filter.measurement import NOISE_ENTRIES, PredictedMeasurement, measurements_of, predict_measurement
-from hub.tracking.filter.prediction import on_floor, predict_targets
 from hub.tracking.filter.target_models import KIND_INDEX, TARGET_MODELS, UPRIGHT
 from hub.tracking.filter.target_states import DetectionStatistics, MultiTargetState, Scan, ScanFrame, Targets
 from hub.tracking.parameters import TrackerParameters, track_label

@@ -18,15 +18,16 @@ from hub.tracking.association.continuation import EntryExitRates, continuation_s
 from hub.tracking.association.scan import FrameEvidence, associate_jointly
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, fused
-from hub.tracking.filter.manoeuvre import (
+from hub.tracking.filter.prediction import (
     continuation_hypotheses,
     fused_predictions,
     log_evidence,
     log_mixture,
     manoeuvre_hypothesis,
+    on_floor,
+    predict_targets,
     widened_by_evidence,
 )
-from hub.tracking.filter.prediction import on_floor, predict_targets
 from hub.tracking.filter.target_states import ScanFrame, Targets
 from hub.tracking.frame_update import prior_of_births
 from hub.tracking.parameters import TrackerParameters

@@ -76,7 +76,6 @@ class SceneRenderer:
         self._size = 1.0
         self._picture_budget, self._budget_at = 1.0, 0.0
         self._framed: tuple[Floats, float] | None = None
-        self.frusta_moved = 0
 
     def clear(self) -> None:
         """Remove everything, as before a seek in a replay."""
@@ -191,7 +190,6 @@ class SceneRenderer:
             frustum.wxyz, frustum.position = wxyz, position
             frustum.scale, frustum.color = scale, COLOURS[status]
             self._labels[name].position = position + 0.25 * scale * _up({name: pose})
-            self.frusta_moved += 1
         std_ms = 1e3 * found.time_offset_std
         sharp = f"± {std_ms:.2g} ms" if std_ms > 0.0 else "" if found.time_offset else "reference clock"
         text = f"{SIGNS[status]} {name}  {sharp if status == 'calibrated' else status}"

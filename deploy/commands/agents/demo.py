@@ -56,8 +56,7 @@ def demo(
     check_range("--cameras", cameras, 2, 20)
     check_range("--seconds", seconds, 5.0, 3600.0)
     check_range("--view-port", view_port, 0, 65535)
-    from deploy.demo.display import ProgressDisplay
-    from deploy.demo.marker import DemoProcesses, DemoSettings
+    from deploy.demo.marker import DemoProcesses, DemoSettings, ProgressDisplay
 
     outcome: Any
     shown = ProgressDisplay("tracking" if scene == "town" else "filming", seconds, quiet=json)

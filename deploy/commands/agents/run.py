@@ -80,7 +80,7 @@ def record(config: Path, /, *, print_config: PrintConfig = False) -> int:
         TOML file: id, site, [bus], out (a .mcap file, or a folder for files named by start time), part_s, part_mb,
         keep_days, keep_mb, keep_free_mb, min_free_mb, foxglove.
     """
-    return _run(config, RecorderConfig, print_config, "deploy.agents.recorder_commands", "start_recorder")
+    return _run(config, RecorderConfig, print_config, "deploy.agents.recorder", "start_recorder")
 
 
 def _run(config: Path, kind: type[Any], print_config: bool, module: str, start: str) -> int:

@@ -10,7 +10,8 @@ from typing import Literal
 from deploy.agents.malloc_tuning import retain_freed_memory
 from deploy.commands.common import Flag, Json, Scheduler, check_seed, command_line
 from deploy.offline.progress import progress_bar
-from hub.api import read_session
+from hub import api
+from hub.api import CalibrationOptions, read_session
 from protocols.core.errors import EXIT_DONE, InputError, Refused
 from protocols.core.files import check_folder
 from protocols.core.lazy import defer_modules
@@ -89,9 +90,6 @@ def calibrate(
         registered; nothing else uses random numbers.
     """
     retain_freed_memory()
-    from hub.api import CalibrationOptions
-    from hub.api import calibrate as solve
-
     check_folder(out)
     check_seed(seed)
     options = CalibrationOptions(solver, from_known, seed=seed, refine_lenses=refine_lenses)
@@ -106,7 +104,7 @@ def calibrate(
         if refusal is not None:
             raise refusal
         with progress_bar(f"calibrating {session.name}", quiet=json) as progress:
-            result = solve(read, options, progress)
+            result = api.calibrate(read, options, progress)
         if hasattr(read, "summaries"):  # of videos, whose clock priors are by their sounds
             from hub.clocks.sound import sound_check
 

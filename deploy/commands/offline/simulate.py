@@ -103,7 +103,7 @@ def simulate(
     check_range("--drops", drops, 0.0, 0.99)
     check_range("--noise-px", noise_px, 0.0, 50.0)
     if scene == _PEOPLE:
-        from deploy.simulation.people import write_people_session
+        from deploy.simulation.session import write_people_session
 
         written = write_people_session(
             out,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from deploy.commands.common import Json, UnusedSeed, answer, check_range, closing_lines
 from deploy.offline.progress import progress_bar
-from protocols.core.errors import InputError
+from protocols.core.errors import InputError, Refused
 
 if TYPE_CHECKING:
     from protocols.core.acceptance import PairReport
@@ -153,7 +153,6 @@ def _estimate(folder: Path, out: Path, quiet: bool) -> tuple[Path, dict[str, str
     from deploy.offline.video_folder import SESSION, session_from_videos
     from hub.api import CALIBRATION, RESULT, calibrate, save_refusal
     from hub.clocks.sound import sound_pairs
-    from protocols.core.errors import Refused
 
     with progress_bar(f"looking for what moves in {folder.name}", quiet=quiet) as progress:
         session = session_from_videos(folder, out / SESSION, progress, detector="auto")

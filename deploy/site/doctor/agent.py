@@ -127,7 +127,7 @@ def bus_path(bus: BusConfig, site: str, role: str, agent: str, patience_s: float
     try:
         if bus.tls is not None and role not in _SUBSCRIBES_TO_ALL:
             return _check_subscriber(config, site, agent, where)
-        from protocols.bus.router.probe import round_trip
+        from protocols.bus.router.selftest import round_trip
 
         prefix = f"syncline/{site}/{'canary' if bus.tls is None else f'agent/{key_segment(agent)}'}/doctor"
         small = round_trip(config, prefix, _SMALL)
@@ -185,7 +185,7 @@ def _check_subscriber(config: BusConfig, site: str, agent: str, where: str) -> C
 def access_rights(bus: BusConfig, site: str, role: str, agent: str, seconds: float = 2.5) -> CheckResult:
     """Check that the router restricts this certificate to its own keys."""
     from protocols.bus.base import BusDead
-    from protocols.bus.router.probe import count_received, round_trip
+    from protocols.bus.router.selftest import count_received, round_trip
 
     config = _as_client(bus)
     if bus.tls is None or config is None:
@@ -211,7 +211,7 @@ def access_rights(bus: BusConfig, site: str, role: str, agent: str, seconds: flo
 def others(bus: BusConfig, site: str, role: str) -> CheckResult:
     """Which agents of the site can be seen: a name in use twice, hubs that do not share it, a site without a hub."""
     from protocols.bus.base import BusDead
-    from protocols.bus.router.probe import agents_alive
+    from protocols.bus.router.selftest import agents_alive
     from protocols.bus.security.sender_identity import SenderValidator
 
     config = _as_client(bus)

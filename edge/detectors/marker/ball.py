@@ -140,11 +140,11 @@ def learn_marker_model(image: npt.NDArray[np.uint8], box: tuple[float, float, fl
 
 
 class MarkerDetector:
-    """Detects the marker in the images of one camera; of earlier images it keeps the background behind the marker.
+    """Detects the one marker in the images of one camera; of earlier images it keeps the background behind it.
 
     model: appearance of the marker. intrinsics: where given, the centre of the ball's outline is corrected to the
-    projection of the ball's centre; they differ by perspective and distortion (``outline_to_centre``). max_detections:
-    best ones reported at most; one marker is one. min_size, max_size: limits of the diameter [px].
+    projection of the ball's centre; they differ by perspective and distortion (``outline_to_centre``). min_size,
+    max_size: limits of the diameter [px].
     """
 
     def __init__(
@@ -152,14 +152,12 @@ class MarkerDetector:
         model: MarkerModel | None = None,
         intrinsics: Intrinsics | None = None,
         *,
-        max_detections: int = 1,
         min_size: float = 0.0,
         max_size: float = math.inf,
     ) -> None:
         self._model = MarkerModel.default() if model is None else model
         self._table = self._model.colours.table()
         self._intrinsics = intrinsics
-        self._max_detections = max_detections
         self._sizes = min_size, max_size
         self._background = StaticBackground()
 
@@ -184,8 +182,7 @@ class MarkerDetector:
             if detection is not None:
                 found.append(detection)
         self._update_background(image, coarse, boxes)
-        found.sort(key=lambda one: one.score * one.size, reverse=True)
-        return found[: self._max_detections]
+        return [max(found, key=lambda one: one.score * one.size)] if found else []
 
     def _update_background(
         self, image: npt.NDArray[np.uint8], coarse: npt.NDArray[np.uint8], boxes: list[tuple[int, int, int, int]]

@@ -55,15 +55,13 @@ class Outline:
     """Fitted outline of a ball.
 
     centre: (2,) [px of the image]. diameter: of the disc of equal area [px]. covariance: (2, 2) of the centre [px²].
-    agreement: share of rays that agree with the fitted curve, 0..1. eccentricity: largest deviation of the curve from a
-    circle, relative to its radius. smear: width of the rim where it is widest [px].
+    agreement: share of rays that agree with the fitted curve, 0..1. smear: width of the rim where it is widest [px].
     """
 
     centre: Floats
     diameter: float
     covariance: Floats
     agreement: float
-    eccentricity: float
     smear: float
 
 
@@ -105,7 +103,6 @@ def measure_outline(
         diameter=float(2.0 * np.sqrt(np.mean(rim * rim))),
         covariance=covariance,
         agreement=float(np.mean(np.abs(residual) < max(0.2 * shape[0], 0.75))),
-        eccentricity=float(np.hypot(shape[1], shape[2]) / shape[0]),
         smear=float(width.max()),
     )
 

@@ -52,7 +52,7 @@ class PersonDetector(SilhouetteDetector):
     model: of the background, mog2 or knn. fps: frame rate where images have no times. confirmed_only: report only
     people who have been detected several times and have moved; otherwise all, with a lower score (see
     ``is_confirmed``). prefix: of the labels; those of several cameras must differ, because cameras do not know each
-    other's people. max_pixels: larger images are downscaled.
+    other's people.
     """
 
     def __init__(
@@ -62,9 +62,8 @@ class PersonDetector(SilhouetteDetector):
         *,
         confirmed_only: bool = True,
         prefix: str = "p",
-        max_pixels: int = _MAX_PIXELS,
     ) -> None:
-        super().__init__(model, fps, prefix, 0.35, confirmed_only, max_pixels)
+        super().__init__(model, fps, prefix, 0.35, confirmed_only, _MAX_PIXELS)
         self._travel = CameraTravel()
         self._moving = False
         self._height_model: HeightModel | None = None

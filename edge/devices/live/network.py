@@ -119,12 +119,11 @@ class NetworkConnection:
 class StreamClock:
     """Maps a stream's time stamps to the host's clock, both in ns, by a constant offset.
 
-    The offset is that of the least delay within the first ``calibration_s`` of a connection; until then each earlier
+    The offset is that of the least delay within the first second of a connection; until then each earlier
     arrival lowers it. It does not follow later delays, which would add the network's jitter to the times.
     """
 
-    def __init__(self, calibration_s: float = 1.0) -> None:
-        self._calibration_ns = round(calibration_s * NANOSECONDS)
+    def __init__(self) -> None:
         self._offset: int | None = None
         self._first = self._last = self._last_time_ns = 0
 
@@ -137,7 +136,7 @@ class StreamClock:
         periods = max(round((stamp - self._last) / NANOSECONDS * fps), 1) if fps > 0.0 else 1
         if stamp <= self._last or stamp - self._last > 60 * NANOSECONDS:  # the sender has restarted
             self._offset, self._first, periods = arrived - stamp, stamp, 1
-        elif stamp - self._first < self._calibration_ns:
+        elif stamp - self._first < NANOSECONDS:
             self._offset = min(self._offset, arrived - stamp)
         time_ns = max(stamp + self._offset, self._last_time_ns + 1)
         self._last, self._last_time_ns = stamp, time_ns

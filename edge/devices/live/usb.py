@@ -156,7 +156,6 @@ class UsbConnection:
         self.fps = float(settings.fps or stream.fps)
         self._first: Any = None
         self._arrival = False
-        self.damaged = 0
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -179,8 +178,7 @@ class UsbConnection:
             return None
         flags = int(frame.buff.flags)
         image = None if flags & _DAMAGED else decode_frame(frame)
-        if image is None:
-            self.damaged += 1  # its number stays a gap
+        if image is None:  # its number stays a gap
             return None
         return Frame(image, self._middle(frame, flags), int(frame.frame_nb), self._exposure_ns)
 

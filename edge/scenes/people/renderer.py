@@ -7,7 +7,6 @@ walking leg moves by a pixel.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,12 +14,9 @@ import numpy.typing as npt
 
 from edge.scenes.common.background import LIGHT_WORLD, PEDESTAL, SensorNoise, static_background, subtract_pedestal
 from edge.scenes.common.base import Renderer
-from edge.scenes.people.scene import RADII, Person, joint_radii
+from edge.scenes.people.scene import RADII, PeopleScene, Person, joint_radii
 from edge.scenes.people.walking import JOINTS
 from protocols.geometry.types import Floats, Image
-
-if TYPE_CHECKING:
-    from edge.scenes.people.scene import PeopleScene
 
 _NOISE_STD = 3.0  # 8-bit steps, of a small sensor indoors
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates

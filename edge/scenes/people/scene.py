@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.scenes.common.base import CameraPlacement, SimulatedScene, SimulatedTrack, place_cameras
-from edge.scenes.people.walking import CROWN, WalkingPaths, body_joints, random_walks
+from edge.scenes.people.walking import CROWN, JOINTS, WalkingPaths, body_joints, random_walks
 from protocols.geometry.types import Bools, Floats
 
 HIDDEN_PX = 3.0
@@ -116,8 +116,6 @@ class PeopleScene(SimulatedScene):
 
 def joint_radii(heights: Floats) -> Floats:
     """Radii of the body around its joints (n, 19) [m]."""
-    from edge.scenes.people.walking import JOINTS
-
     share = {"crown": 0.0, "head": RADII["head"], "neck": RADII["neck"], "chest": RADII["torso"]}
     share |= {"pelvis": RADII["pelvis"], "shoulder": 0.045, "elbow": RADII["arm"], "hand": RADII["arm"]}
     share |= {"hip": RADII["thigh"], "knee": RADII["shank"], "ankle": 0.03, "toe": 0.02}

@@ -11,9 +11,8 @@ from hub.bundle.datum.gauge import fix_gauge
 from hub.bundle.initialisation import SEEN_WITHIN_S, seen_by_two
 from hub.bundle.problem import CAMERA_PARAMETERS, Column
 from hub.calibration.notes import jitter_notes, readout_notes
-from hub.calibration.rigid_body.adjustment import BodyCovariance, body_covariance, path_covariance
+from hub.calibration.rigid_body.adjustment import BodyCovariance, body_covariance, path_covariance, residuals
 from hub.calibration.rigid_body.lag import BodyPair
-from hub.calibration.rigid_body.noise import residuals
 from hub.calibration.rigid_body.problem import BodyProblem, BodyState, frame_interval
 from hub.trajectory.discrete import INSTANT_TOLERANCE_S, PointBasis
 from hub.two_view.relative_pose import fundamental_from, relative_pose_between

@@ -60,15 +60,13 @@ class Associator:
             del self._pending[seen.label]
         return out
 
-    def add_neighbour(self, seen: SharedObservation) -> tuple[int, PairedRow] | None:
+    def add_neighbour(self, seen: SharedObservation) -> PairedRow | None:
         """Add a neighbour's observation; returns the pair if this camera observed the target at that time."""
         track = self._own.get(seen.label)
         if track is not None:
             pair, final = _associate(track, seen, self.gap)
-            if pair is not None:
-                return seen.camera, pair
-            if final:
-                return None
+            if pair is not None or final:
+                return pair
         pending = self._pending.get(seen.label)
         if pending is None:
             pending = self._pending[seen.label] = deque(maxlen=_PENDING_CAPACITY)

@@ -104,7 +104,6 @@ class PoseNode:
         self._associator = Associator(gap)
         self._neighbours: dict[int, Neighbour] = {}
         self._anchors: dict[int, Anchor] = {}
-        self._recovering = 0
         self._pending = 0
         self._contradicted_updates = 0
         self._converged_updates = 0
@@ -228,8 +227,8 @@ class PoseNode:
         if reason:
             self.refused[reason] += 1
             return []
-        pair = self._associator.add_neighbour(seen)
-        return [] if pair is None else self._pair(neighbour, pair[1])
+        paired = self._associator.add_neighbour(seen)
+        return [] if paired is None else self._pair(neighbour, paired)
 
     def _neighbour(self, camera: int) -> Neighbour:
         if camera not in self._neighbours:
@@ -364,8 +363,7 @@ class PoseNode:
 
     # the update
 
-    def _terms(self, *, ahead: bool = True) -> list[FactorTerm]:
-        del ahead
+    def _terms(self) -> list[FactorTerm]:
         terms = []
         for neighbour in self._neighbours.values():
             other, factor = self._pose_in_frame(neighbour), neighbour.edge.factor
@@ -402,8 +400,6 @@ class PoseNode:
         if not terms:
             return
         hessian, gradient = normal_equations(self._extrapolated, terms)
-        if self._recovering > 0:
-            self._recovering -= 1
         scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
         scaled = hessian / scale / scale[:, None] + 1e-6 * np.eye(6)
         full = -np.linalg.solve(scaled, gradient / scale) / scale
@@ -519,7 +515,7 @@ class PoseNode:
             return []
         self.epoch += 1
         self.pose = self._extrapolated = retract(self.pose, step)
-        self._momentum, self._recovering = 0, 64
+        self._momentum = 0
         for neighbour in self._neighbours.values():
             neighbour.edge.reset()
         out: list[Output] = [Notice(self.camera, "bumped", f"by {np.degrees(np.linalg.norm(step[:3])):.2f} degrees")]

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY, log_density
-from hub.tracking.filter.manoeuvre import ManoeuvreHypothesis, log_mixture
+from hub.tracking.filter.prediction import ManoeuvreHypothesis, log_mixture
 from hub.tracking.filter.target_models import CLUTTER_COLOUR_STD, TARGET_MODELS
 from hub.tracking.filter.target_states import Targets
 from protocols.geometry.types import Floats, Ints

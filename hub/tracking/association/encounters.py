@@ -16,8 +16,14 @@ from hub.tracking.association.assignment import colour_score
 from hub.tracking.association.scan import FrameEvidence, ScanResult, associate_jointly
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, log_density
-from hub.tracking.filter.manoeuvre import log_evidence, log_mixture, manoeuvre_hypothesis, widened_by_evidence
-from hub.tracking.filter.prediction import on_floor, predict_targets
+from hub.tracking.filter.prediction import (
+    log_evidence,
+    log_mixture,
+    manoeuvre_hypothesis,
+    on_floor,
+    predict_targets,
+    widened_by_evidence,
+)
 from hub.tracking.filter.target_models import UPRIGHT
 from hub.tracking.filter.target_states import Encounters, Scan, Targets
 from hub.tracking.parameters import TrackerParameters

@@ -8,8 +8,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY, log_density
-from hub.tracking.filter.manoeuvre import log_mixture, manoeuvre_hypothesis, units_of
-from hub.tracking.filter.prediction import predict_targets
+from hub.tracking.filter.prediction import log_mixture, manoeuvre_hypothesis, predict_targets, units_of
 from hub.tracking.filter.target_models import TARGET_MODELS, UPRIGHT
 from hub.tracking.filter.target_states import MultiTargetState, Targets
 from hub.tracking.parameters import TrackerParameters

@@ -16,8 +16,8 @@ from mcap.reader import make_reader
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import completed_file
+from protocols.log.layout import is_foxglove, schema_of
 from protocols.log.read.reader import LogReader
-from protocols.log.schemas import is_foxglove, schema_of
 from protocols.log.write.writer import LogWriter
 
 

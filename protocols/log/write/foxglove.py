@@ -36,7 +36,7 @@ from protocols.core.jpeg import ThumbnailScale, thumbnail_scale
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
-from protocols.log.schemas import FOXGLOVE_PREFIX
+from protocols.log.layout import FOXGLOVE_PREFIX
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import METRES_PER_UNIT
 

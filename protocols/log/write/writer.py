@@ -1,24 +1,31 @@
-"""Crash-safe writer of MCAP logs: what was synced stays readable if the process dies."""
+"""Crash-safe writer of MCAP logs: what was synced stays readable if the process dies.
+
+Its chunks take the place of the chunk builder of mcap's own writer, whose interface they have: that takes 4 us for a
+message in ten calls, this 1 us in one; the same bytes. Where a later mcap has none to replace, `faster` says so, and
+the writer is used as it is.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import os
+import struct
+from array import array
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn, cast
 
 from google.protobuf.message import Message
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
 from protocols.core.closing import Closing
 from protocols.core.errors import InputError
 from protocols.core.version import VERSION
-from protocols.log.layout import CHANNEL_RECORD, FORMAT_RECORD, LOG_VERSION, channel_record, with_checksum
-from protocols.log.schemas import schema_of
-from protocols.log.write.chunks import faster
+from protocols.log.layout import CHANNEL_RECORD, FORMAT_RECORD, LOG_VERSION, channel_record, schema_of, with_checksum
 from protocols.topics import Topic
 from protocols.validation.codec import encode, message_class, parse_key
 from protocols.validation.rules import SCHEMA_VERSION
@@ -35,6 +42,9 @@ An unfinished chunk is lost if the process dies; 1 MiB of small messages is 12 s
 """
 MAX_CHANNELS = 16_384
 """Keys in one file: 1,000 cameras have 12,000, with those for viewers. The format numbers them with 16 bits."""
+_BUILDER, _STATISTICS = "_Writer__chunk_builder", "_Writer__statistics"
+_MESSAGE = struct.Struct("<BQHIQQ")
+_HEAD = 2 + 4 + 8 + 8  # bytes: channel, sequence, two times
 
 
 class LogWriter(Closing):
@@ -259,3 +269,84 @@ def _sync_folder(folder: Path) -> None:
 def _format(part: tuple[str, int] | None, schema: int) -> dict[str, str]:
     values = {"log": str(LOG_VERSION), "schema": str(schema), "syncline": VERSION}
     return with_checksum(values if part is None else {**values, "session": part[0], "part": str(part[1])})
+
+
+class _Index(array):  # type: ignore[type-arg]
+    """Times and offsets of one channel's messages, in turn."""
+
+    channel_id: int
+
+    def write(self, stream: Any) -> None:
+        """Write the index record."""
+        stream.start_record(Opcode.MESSAGE_INDEX)
+        stream.write2(self.channel_id)
+        stream.write4(8 * len(self))
+        stream.write(struct.pack(f"<{len(self)}Q", *self))
+        stream.finish_record()
+
+
+class Chunk:
+    """The messages of a chunk, encoded. statistics: of the whole file, which mcap's writer has."""
+
+    def __init__(self, statistics: Any) -> None:
+        self._statistics = statistics
+        self._buffer = bytearray()
+        self.message_indices: dict[int, _Index] = {}
+        self.message_start_time = self.message_end_time = 0
+
+    @property
+    def count(self) -> int:
+        """Bytes so far."""
+        return len(self._buffer)
+
+    @property
+    def num_messages(self) -> int:
+        """Messages so far."""
+        return sum(map(len, self.message_indices.values())) // 2
+
+    def add(self, channel: int, log_time: int, data: bytes, publish_time: int, sequence: int) -> int:
+        """Add a message; the bytes of the chunk with it."""
+        index = self.message_indices.get(channel)
+        if index is None:
+            index = self.message_indices[channel] = _Index("Q")
+            index.channel_id = channel
+        buffer = self._buffer
+        index.append(log_time)
+        index.append(len(buffer))
+        buffer += _MESSAGE.pack(Opcode.MESSAGE, _HEAD + len(data), channel, sequence, log_time, publish_time)
+        buffer += data
+        return len(buffer)
+
+    def add_channel(self, channel: Any) -> None:
+        """Add a channel record; also a schema's."""
+        builder: Any = RecordBuilder()  # without types
+        channel.write(builder)
+        self._buffer += builder.end()
+
+    add_schema = add_channel
+
+    def end(self) -> bytearray:
+        """The chunk's records; its messages are counted, its times known from then on."""
+        whole, times = self._statistics, [index[::2] for index in self.message_indices.values()]
+        self.message_start_time, self.message_end_time = min(map(min, times)), max(map(max, times))
+        first = not whole.message_count
+        whole.message_start_time = min(self.message_start_time, whole.message_start_time if not first else 2**64)
+        whole.message_end_time = max(self.message_end_time, whole.message_end_time)
+        for channel, index in self.message_indices.items():
+            whole.channel_message_counts[channel] += len(index) // 2
+            whole.message_count += len(index) // 2
+        return self._buffer
+
+    def reset(self) -> None:
+        """Begin the next one."""
+        self._buffer = bytearray()
+        self.message_indices.clear()
+
+
+def faster(writer: Any) -> Chunk | None:
+    """Put a faster chunk into a new writer of mcap's; None where it has no place for it."""
+    if not (hasattr(writer, _BUILDER) and hasattr(writer, _STATISTICS)):
+        return None
+    chunk = Chunk(getattr(writer, _STATISTICS))
+    setattr(writer, _BUILDER, chunk)
+    return chunk

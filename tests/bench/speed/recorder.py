@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from protocols.log.schemas import schema_of
+from protocols.log.layout import schema_of
 from protocols.log.write.writer import LogWriter
 from protocols.topics import FLIGHT_IMAGE, OBSERVATION, Topic
 from protocols.validation.codec import encode

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
-from deploy.agents.recorder_commands import record_on_command, with_unused_log_path
+from deploy.agents.recorder import record_on_command, with_unused_log_path
 from deploy.config.agents import RecorderConfig
 from hub.live.agent import run_hub
 from hub.live.live_hub import LiveHub

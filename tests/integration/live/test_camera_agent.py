@@ -233,8 +233,9 @@ def test_a_simulated_camera_from_pixels_to_messages() -> None:
 
 
 class WarmDevice(ListedDevice):
-    """Has a temperature sensor."""
+    """A live camera with a temperature sensor."""
 
+    disconnected, reconnections = False, 0
     temperature: float | None = 61.5
 
 

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy.agents import recorder_commands
-from deploy.agents.recorder import RecorderResult, count_missing, run_recorder
-from deploy.agents.recorder_commands import record_on_command
+from deploy.agents import recorder
+from deploy.agents.recorder import RecorderResult, count_missing, record_on_command, run_recorder
 from deploy.agents.retention import Retention, Space, free_bytes, unused_log_path
 from deploy.cli import run
 from deploy.commands.agents import run as agents
@@ -137,7 +136,7 @@ def test_a_disk_that_fails_at_every_try_is_told_between_them(tmp_path: Path, mon
                 stop.set()
             return RecorderResult(config.out, 0, {}, 0, "no space left on the disk")
 
-        monkeypatch.setattr(recorder_commands, "run_recorder", failing)
+        monkeypatch.setattr(recorder, "run_recorder", failing)
         config = RecorderConfig(out=tmp_path, min_free_mb=0.0, min_free_percent=0.0)
         record_on_command(config, bus, threading.Event())
     for said in statuses_before[1:]:

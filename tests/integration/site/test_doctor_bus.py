@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from deploy.site.doctor import agent
-from protocols.bus.router import probe
+from protocols.bus.router import selftest
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig, TlsConfig
 from protocols.bus.transport.session import open_session
@@ -52,7 +52,7 @@ def test_a_name_in_use_twice_and_a_site_without_a_hub_are_warned_of() -> None:
     ):
         up.enter_context(lab.announce("hub", "hub", "boot-1"))
         up.enter_context(yard.announce("camera", "cam é", "boot-2"))
-        eventually(lambda: len(probe.agents_alive(config)) == 2)
+        eventually(lambda: len(selftest.agents_alive(config)) == 2)
         found = agent.others(config, "yard", "camera")
         assert found.verdict == "warn"
         assert 'no hub of site "yard" runs here, but one of site "lab"' in found.text
@@ -100,7 +100,7 @@ def test_a_path_that_drops_all_messages(
     def trip(config: BusConfig, prefix: str, size: int = 0, timeout_s: float = 3.0) -> float | None:
         return passes[size]
 
-    monkeypatch.setattr(probe, "round_trip", trip)
+    monkeypatch.setattr(selftest, "round_trip", trip)
     found = agent.bus_path(BusConfig(mode="client"), SITE, "hub", "hub")
     assert (found.verdict, remedy in found.remedy) == (verdict, True)
 

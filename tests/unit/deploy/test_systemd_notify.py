@@ -130,7 +130,7 @@ def test_waiting_for_an_unplugged_camera_keeps_the_watchdog_alive() -> None:
     class Board:
         def __init__(self) -> None:
             self.info = DeviceInfo(2, 2, 1.0, "test", "monotonic")
-            self.ended, self.disconnected, self.reconnections = False, False, 3
+            self.ended, self.disconnected, self.reconnections, self.temperature = False, False, 3, None
 
         def open(self) -> None: ...
 

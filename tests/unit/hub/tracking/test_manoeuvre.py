@@ -12,14 +12,14 @@ from edge.scenes.common.base import look_at_pose
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter import kalman
 from hub.tracking.filter.kalman import LOG_SIZE, STATE_DIM, VELOCITY
-from hub.tracking.filter.manoeuvre import (
+from hub.tracking.filter.prediction import (
     fused_predictions,
     gpb1_update,
     manoeuvre_hypothesis,
+    predict_targets,
     widened_by_evidence,
     within_reach,
 )
-from hub.tracking.filter.prediction import predict_targets
 from hub.tracking.filter.target_models import KIND_INDEX, MARKER, PERSON
 from hub.tracking.filter.target_states import Targets
 from hub.tracking.parameters import TrackerParameters

@@ -16,7 +16,7 @@ from hub.tracking.association.assignment import (
     matching_colour_std,
     update_colour_variance,
 )
-from hub.tracking.association.marginals import marginal_probabilities
+from hub.tracking.association.scan import marginal_probabilities
 from hub.tracking.detections import TrackingCamera, frame_detections
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.measurement import student_t_cost, student_t_inflation

@@ -17,8 +17,8 @@ from deploy.logs.info import describe_log
 from protocols.core.jpeg import jpeg_size
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
+from protocols.log.layout import FOXGLOVE_SCHEMAS, schema_of
 from protocols.log.read.reader import LogReader
-from protocols.log.schemas import FOXGLOVE_SCHEMAS, schema_of
 from protocols.log.write.foxglove import quaternion
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb

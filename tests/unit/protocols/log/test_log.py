@@ -125,7 +125,7 @@ def test_equal_logs_are_equal_bytes(tmp_path: Path) -> None:
 def test_chunks_are_those_of_mcap_s_own_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where a later mcap has no place for faster ones: then its own are used."""
     write_log(tmp_path / "a.mcap", 1000)
-    monkeypatch.setattr("protocols.log.write.chunks._BUILDER", "none")
+    monkeypatch.setattr("protocols.log.write.writer._BUILDER", "none")
     with LogWriter(tmp_path / "c.mcap") as log:
         assert log._chunk is None
     write_log(tmp_path / "b.mcap", 1000)

@@ -8,8 +8,7 @@ import pytest
 
 from deploy.cli import run
 from protocols.core.errors import InputError
-from protocols.log.read.parts import find_parts
-from protocols.log.read.reader import LogMessage, LogReader
+from protocols.log.read.reader import LogMessage, LogReader, find_parts
 from protocols.log.read.recovery import recover
 from protocols.log.read.session import load_session
 from protocols.log.write.rotation import RotatingWriter
