@@ -26,10 +26,10 @@ from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.csv_table import CsvTable, read_csv_header, read_csv_table
 from protocols.session.detections import KINDS, DetectionRows, read_detections, swapped_ends
+from protocols.session.folder import BOXES_FILE
 from protocols.validation.rules import SCHEMA_VERSION
 
 Kind = Literal["person", "vehicle"]
-BOXES_FILE = "boxes.csv"
 _BOX_COLUMNS = ("camera", "frame", "time", "x", "y", "width", "height")
 _MAX_TIME_S = 9e9
 """Beyond it a time [s] does not fit into 64 bits of nanoseconds."""
@@ -201,8 +201,10 @@ def _check_pairs(rows: DetectionRows, file: Path) -> None:
         raise InputError(what, file=file, line=line, remedy="swap the labels")
 
 
-def object_messages(rows: DetectionRows) -> list[pb.Observation]:
+def object_messages(rows: DetectionRows, interval_ns: int = 0) -> list[pb.Observation]:
     """The rows as observation messages with all that is known of each detection, by camera and time.
+
+    interval_ns: between the frames of a camera that are taken, at least.
 
     ``sequence`` is the frame number where a camera's frames are numbered, otherwise it counts. Where they are
     numbered, frames without a row between two with rows have a message too: nobody was detected.
@@ -220,7 +222,11 @@ def object_messages(rows: DetectionRows) -> list[pb.Observation]:
         order = np.argsort(np.concatenate([stamps, empty_stamps]), kind="stable").tolist()
         every_stamp = np.concatenate([stamps, empty_stamps]).tolist()
         every_frame = np.concatenate([frames, empty_frames]).tolist()
+        last = -math.inf
         for index, at in enumerate(order):
+            if every_stamp[at] - last < interval_ns:
+                continue
+            last = every_stamp[at]
             message = pb.Observation(
                 schema_version=SCHEMA_VERSION, camera=name, boot_id="session", device_time_ns=every_stamp[at],
                 sequence=every_frame[at] if numbered else index, frame=max(every_frame[at], 0),
