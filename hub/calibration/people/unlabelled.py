@@ -13,11 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from hub.bundle.initialisation import Reconstruction, triangulate_and_adjust
-from hub.bundle.model_comparison import refuted_lenses
+from hub.bundle.model_comparison import LENS, refuted_lenses
 from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
 from hub.calibration.final_adjustment import final_adjustment
-from hub.calibration.given_values import LENS
 from hub.calibration.pairs.pair_network import Progress
 from hub.calibration.people import END_STD, MIN_INTERVAL_NS
 from hub.calibration.people.ground_plane import Bodies, GroundPlane, estimate_ground_plane
