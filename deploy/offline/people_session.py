@@ -11,8 +11,8 @@ from deploy.offline.follow.objects import (
     is_boxes_file,
     object_messages,
     read_objects,
+    without_clock_steps,
 )
-from deploy.offline.follow.source import without_clock_steps
 from hub.api import RecordedSession
 from hub.calibration.people import MIN_INTERVAL_NS
 from protocols.core.errors import Refused

@@ -7,14 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from deploy.offline.follow.calibration import GivenCalibration, read_given_calibration
 from deploy.offline.follow.objects import (
     Kind,
     followed_detections,
     object_messages,
     read_objects,
+    without_clock_steps,
 )
 from deploy.offline.follow.units import check_units
 from deploy.offline.progress import Progress
@@ -33,8 +32,6 @@ from protocols.topics import OBSERVATION
 LOG_OF_VIDEOS = "detections.mcap"
 _SAME_TIME_NS = NANOSECONDS
 """Cameras at 1 Hz need not have their frames at one time."""
-_MAX_INTERVAL_S = 10.0
-"""Between frames. Nobody is followed over so long; 60 frames a second in milliseconds seem 16.7 s apart."""
 _MAX_ROWS = 2_000_000
 """Reference times at which tracks are wanted: 18 h at 30 Hz."""
 
@@ -164,36 +161,6 @@ def check_log(file: Path, calibration: Path) -> tuple[str, ...]:
     known = read_given_calibration(calibration)
     found, _ = followed_detections(without_clock_steps(_read_log(file)[0], file)[0], "person", known.sizes)
     return check_units(found, known, "person", file) if any(message.detections for message in found) else ()
-
-
-def without_clock_steps(messages: list[pb.Observation], file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
-    """The messages on the longer side of a step of their camera's clock, as `calibrate` takes it; and warnings.
-
-    A clock that was set back is told by the frames' numbers, if these increase.
-
-    Raises InputError where the frames of all cameras are too far apart.
-    """
-    kept = set[int]()
-    intervals: list[float] = []
-    warnings = []
-    for camera in dict.fromkeys(message.camera for message in messages):
-        mine = sorted((m for m in messages if m.camera == camera), key=lambda one: (one.frame, one.device_time_ns))
-        times = np.array([message.device_time_ns for message in mine]) / NANOSECONDS
-        back = np.flatnonzero(np.diff(times) < 0.0)
-        if len(back) != 1 or times[back[0] + 1] < times[0]:  # no clock set back once, but numbers in another order
-            back, mine, times = back[:0], sorted(mine, key=lambda one: one.device_time_ns), np.sort(times)
-        gaps = np.diff(times)
-        intervals += [float(np.median(gaps))] if len(gaps) else []
-        steps = np.union1d(back, np.flatnonzero(gaps > MAX_PAUSE_S))
-        part = max(np.split(np.arange(len(mine)), steps + 1), key=len)
-        kept |= {id(mine[i]) for i in part.tolist()}
-        if len(part) < len(mine):
-            left = f"{len(mine) - len(part)} of {len(mine)} frames on the other side are left out"
-            warnings.append(f"{camera}: its clock steps by {max(gaps[steps], key=abs):.0f} s; {left}")
-    if min(intervals, default=0.0) > _MAX_INTERVAL_S:
-        what = f"frames are {min(intervals):.4g} s apart, over which nobody is followed"
-        raise InputError(what, file=file, remedy="give times in seconds, not in milliseconds or another unit")
-    return [one for one in messages if id(one) in kept], tuple(warnings)
 
 
 def _reference_times(messages: list[pb.Observation], known: GivenCalibration) -> dict[str, set[int]]:

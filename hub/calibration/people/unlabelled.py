@@ -275,7 +275,7 @@ def _labelled(
     times = [one.device_time_ns + lags[one.camera] for one in seen]
     followed = follow(seen, start, range(min(times), max(times) + 1, _WANTED_INTERVAL_NS), up=up)
     by_key = {(one.camera, one.sequence): one for one in seen}
-    hidden = _touching(seen, initial, followed.tracks, up)
+    hidden = _touching([one for one in seen if _has_silhouettes(one)], initial, followed.tracks, up)
     bodies: dict[str, list[tuple[int, int, pb.Detection, Bodies]]] = {name: [] for name in initial}
     for track in followed.tracks:
         if len({name for name, _, _ in track.detections}) < 2 or len(track.detections) < _ROWS_OF_PERSON:
@@ -317,6 +317,11 @@ def _labelled(
         stds=np.array(stds),
         order=rig.cameras,
     )
+
+
+def _has_silhouettes(message: pb.Observation) -> bool:
+    """Whether the head of anybody is not above the foot, as in a box it is."""
+    return any(d.head and d.foot and abs(d.head[0] - d.foot[0]) >= _ONE_COLUMN_PX for d in message.detections)
 
 
 def _of_people(bodies: Sequence[tuple[int, Bodies]]) -> GroundPlane | None:
