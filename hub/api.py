@@ -28,7 +28,7 @@ from protocols.session.calibration import (
     read_calibration,
     trajectory_text,
 )
-from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
+from protocols.session.folder import RIG_FILE, labelled_file
 from protocols.session.observations import Observations, read_observations
 from protocols.session.result import refusal_document, result_document, result_text
 from protocols.session.rig import Rig, read_rig
@@ -402,7 +402,7 @@ def _read_rows(session: Path, observations: Path | None, rig: Rig) -> tuple[Obse
     if session.is_dir() and (session / RIG_FILE).exists():
         names |= dict.fromkeys(read_rig(session / RIG_FILE).cameras)
     names |= dict.fromkeys(rig.metadata.get("refused", {}))
-    seen = read_observations(observations or (session / OBSERVATIONS_FILE if session.is_dir() else session), names)
+    seen = read_observations(observations or (labelled_file(session) if session.is_dir() else session), names)
     return seen, seen.warnings
 
 

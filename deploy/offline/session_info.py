@@ -8,21 +8,30 @@ from typing import Any
 
 import numpy as np
 
-from protocols.session.folder import read_folder
+from deploy.offline.follow.objects import read_objects
+from protocols.session.folder import BOXES_FILE, OBSERVATIONS_FILE, RIG_FILE, read_folder
+from protocols.session.observations import Observations
+from protocols.session.rig import read_rig
 
 
 def describe_session(folder: Path) -> dict[str, Any]:
     """Cameras and tracks of a session folder. Raises InputError."""
-    rig, observations = read_folder(folder)
+    if (folder / BOXES_FILE).exists() and not (folder / OBSERVATIONS_FILE).exists():
+        rig, observations = read_rig(folder / RIG_FILE), Observations({})
+        boxes = read_objects(folder / BOXES_FILE, {name: camera.size for name, camera in rig.cameras.items()})
+    else:
+        boxes, (rig, observations) = None, read_folder(folder)
     cameras = {}
     for name, camera in rig.cameras.items():
         tracks = observations.of_camera(name)
-        times = np.concatenate([track.time for track in tracks]) if tracks else np.zeros(0)
+        times = np.concatenate([np.zeros(0), *(track.time for track in tracks)])
+        if boxes is not None:
+            times = boxes.time[np.array(boxes.camera) == name]
         cameras[name] = {
             "size": list(camera.size),
             "fps": camera.fps,
             "calibrated": camera.intrinsics is not None,
-            "rows": sum(len(track) for track in tracks),
+            "rows": len(times),
             "labels": [track.label for track in tracks],
             "begin": float(times.min()) if len(times) else None,
             "end": float(times.max()) if len(times) else None,

@@ -18,6 +18,7 @@ from protocols.session.rig import Rig, misspelt_keys, read_rig
 
 RIG_FILE = "rig.toml"
 OBSERVATIONS_FILE = "observations.csv"
+BOXES_FILE = "boxes.csv"
 _MANY_TIMES = 10  # distinct ones that are all whole by chance: of stamps in tenths of a second one set in 10^10
 _WRONG_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 _SAME_INTERVAL = 0.2  # relative: rows that are so near a frame's interval apart, in such a unit, are in it
@@ -48,8 +49,18 @@ def read_folder(folder: Path, observations: Path | None = None) -> tuple[Rig, Ob
             remedy="write one: a table per camera, see `syncline simulate`",
         )
     rig = read_rig(folder / RIG_FILE)
-    found = read_observations(observations or folder / OBSERVATIONS_FILE, rig.cameras)
+    found = read_observations(observations or labelled_file(folder), rig.cameras)
     return rig, replace(found, warnings=found.warnings + column_warnings(rig, found) + misspelt_keys(rig))
+
+
+def labelled_file(folder: Path) -> Path:
+    """The observations.csv of a session folder. Raises InputError where it has a boxes.csv in its place."""
+    file = folder / OBSERVATIONS_FILE
+    if not file.exists() and (folder / BOXES_FILE).exists():
+        what = f"no {OBSERVATIONS_FILE}, but {BOXES_FILE}: its people have no labels"
+        remedy = "use `syncline calibrate` or `syncline follow`; in Python calibrate(deploy.people_session(folder))"
+        raise InputError(what, file=folder, remedy=remedy)
+    return file
 
 
 def column_warnings(rig: Rig, observations: Observations) -> tuple[str, ...]:

@@ -1,10 +1,11 @@
 """Cameras calibrated by unlabelled people.
 
-    python -m tests.bench.unlabelled_people [--seeds 3] [--halls 6]
+    python -m tests.bench.unlabelled_people [--seeds 3] [--halls 6] [--long]
 
 crowd: the boxes of ``../shared/data/crowd``, spoilt as by ``tests.bench.crowd``, without poses, against the
 calibration that comes with them; one shared clock. hall: simulated halls (``tests.bench.hall``)
-whose cameras share no clock, begin up to 15 s late, and take their frames spread over 16/60 s. Prints the cameras that
+whose cameras share no clock, begin up to 15 s late, and take their frames spread over 16/60 s. --long: halls of 5 and
+10 minutes instead, of which each camera films from up to 40 % to 70 % or later. Prints the cameras that
 are placed, the worst position [cm] and rotation [deg] after one similarity, the worst lag [ms] and error over its std,
 and CPU seconds.
 """
@@ -34,6 +35,9 @@ from tests.bench.scoring import pose_differences
 
 SPREAD_S = 16.0 / hall.STEPS_HZ  # whole steps of the walk, so that every camera sees people where they are
 LATEST_S = 15.0
+LATEST, EARLIEST = 0.4, 0.7  # shares of a long recording between which all cameras film
+LONG = ((3, 5, 30.0, 300.0, 6.0), (4, 4, 2.0, 600.0, 6.0), (3, 4, 10.0, 600.0, 6.0))
+"""Cameras, people, frames a second, seconds, half the side [m] of the long halls."""
 
 
 def crowd(data: Path, spoil: float, seed: int) -> str:
@@ -53,15 +57,18 @@ def crowd(data: Path, spoil: float, seed: int) -> str:
     return row(rig, people, truth)
 
 
-def simulated(seed: int, cameras: int, people: int, fps: float, seconds: float, half: float) -> str:
+def simulated(seed: int, cameras: int, people: int, fps: float, seconds: float, half: float, long: bool = False) -> str:
     """The row of a hall."""
     made = hall.simulated(seed, cameras, people, fps, seconds, half, lag=SPREAD_S)
     truth = made.calibration.cameras
-    begins = dict(zip(truth, np.random.default_rng(seed).uniform(0.0, LATEST_S, len(truth)), strict=True))
+    rng = np.random.default_rng(seed)
+    latest, earliest = (LATEST * seconds, EARLIEST * seconds) if long else (LATEST_S, seconds + SPREAD_S)
+    begins = dict(zip(truth, rng.uniform(0.0, latest, len(truth)), strict=True))
+    ends = dict(zip(truth, rng.uniform(earliest, seconds + SPREAD_S, len(truth)), strict=True))
     rig = Rig(
         {name: RigCamera(name=name, size=hall.SIZE, fps=fps, intrinsics=truth[name].intrinsics) for name in truth}
     )
-    return row(rig, [one for moment, one in made.messages if moment >= begins[one.camera]], truth)
+    return row(rig, [one for moment, one in made.messages if begins[one.camera] <= moment <= ends[one.camera]], truth)
 
 
 def row(rig: Rig, people: Sequence[pb.Observation], truth: dict[str, CameraCalibration]) -> str:
@@ -90,8 +97,14 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=3, help="number of seeds of the crowd's spoiling")
     parser.add_argument("--spoil", type=float, default=1.0, help="factor of misses, noise and false boxes; 0 = none")
     parser.add_argument("--halls", type=int, default=6, help="number of halls")
+    parser.add_argument("--long", action="store_true", help="long halls only")
     parser.add_argument("--first", type=int, default=0, help="first seed of both")
     options = parser.parse_args()
+    for seed, kind in enumerate(LONG if options.long else (), options.first):
+        words = "{} cameras, {} people, {:g} fps, {:g} s".format(*kind)
+        print(f"long hall {seed}, {words}: {simulated(seed, *kind, long=True)}", flush=True)
+    if options.long:
+        return 0
     if (options.data / "crowd" / "boxes.csv").is_file():
         for seed in range(options.first, options.first + options.seeds):
             print(

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from deploy.offline.follow.objects import BOXES_FILE
 from protocols.core.errors import InputError
 from protocols.core.files import read_text, read_toml
 from protocols.formats import colmap, keypoints, opensfm, points, toml_rigs, xml_rigs, yaml_rigs
 from protocols.formats.cameras import ForeignRig, rig_tables
 from protocols.geometry.types import Floats, Ints
-from protocols.session.folder import RIG_FILE, write_rig
+from protocols.session.folder import BOXES_FILE, RIG_FILE, write_rig
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import parse_camera_table
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deploy.offline.follow.objects import BOXES_FILE, complete_detections, is_boxes_file, object_messages, read_objects
+from deploy.offline.follow.objects import complete_detections, is_boxes_file, object_messages, read_objects
 from hub.live.messages import rig_message
 from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.errors import InputError
@@ -18,7 +18,7 @@ from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration, read_calibration
 from protocols.session.csv_table import read_csv_header
-from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
+from protocols.session.folder import BOXES_FILE, OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig, read_rig
 from protocols.validation.rules import SCHEMA_VERSION

@@ -19,6 +19,7 @@ from typing import Literal
 import numpy as np
 
 from edge.detectors.base import CUT_VEHICLE_STD
+from hub.trajectory.image_tracks import MAX_PAUSE_S
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.ranges import MAX_PIXEL
@@ -26,10 +27,10 @@ from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.csv_table import CsvTable, read_csv_header, read_csv_table
 from protocols.session.detections import KINDS, DetectionRows, read_detections, swapped_ends
+from protocols.session.folder import BOXES_FILE
 from protocols.validation.rules import SCHEMA_VERSION
 
 Kind = Literal["person", "vehicle"]
-BOXES_FILE = "boxes.csv"
 _BOX_COLUMNS = ("camera", "frame", "time", "x", "y", "width", "height")
 _MAX_TIME_S = 9e9
 """Beyond it a time [s] does not fit into 64 bits of nanoseconds."""
@@ -44,6 +45,8 @@ _MAX_ROUNDED = 1.1
 _STD_PX, _CUT_ACROSS, _CUT_ALONG = 1.5, 0.1, 0.5
 """Of the middle of a box that the border cuts: as of any detection without a covariance, and over its height, across
 a body of whom half the width may be out of the picture, and along one of whom a third to all is in it."""
+_MAX_INTERVAL_S = 10.0
+"""Between frames. Nobody is followed over so long; 60 frames a second in milliseconds seem 16.7 s apart."""
 _MAX_EMPTY_PER_FRAME = 20
 """Frames without a row that are added for one with rows. Rarer numbers are labels, not a numbering of the frames."""
 
@@ -201,8 +204,10 @@ def _check_pairs(rows: DetectionRows, file: Path) -> None:
         raise InputError(what, file=file, line=line, remedy="swap the labels")
 
 
-def object_messages(rows: DetectionRows) -> list[pb.Observation]:
+def object_messages(rows: DetectionRows, interval_ns: int = 0) -> list[pb.Observation]:
     """The rows as observation messages with all that is known of each detection, by camera and time.
+
+    interval_ns: between the frames of a camera that are taken, at least.
 
     ``sequence`` is the frame number where a camera's frames are numbered, otherwise it counts. Where they are
     numbered, frames without a row between two with rows have a message too: nobody was detected.
@@ -220,7 +225,11 @@ def object_messages(rows: DetectionRows) -> list[pb.Observation]:
         order = np.argsort(np.concatenate([stamps, empty_stamps]), kind="stable").tolist()
         every_stamp = np.concatenate([stamps, empty_stamps]).tolist()
         every_frame = np.concatenate([frames, empty_frames]).tolist()
+        last = -math.inf
         for index, at in enumerate(order):
+            if every_stamp[at] - last < interval_ns:
+                continue
+            last = every_stamp[at]
             message = pb.Observation(
                 schema_version=SCHEMA_VERSION, camera=name, boot_id="session", device_time_ns=every_stamp[at],
                 sequence=every_frame[at] if numbered else index, frame=max(every_frame[at], 0),
@@ -254,6 +263,36 @@ def _empty_frames(stamps: Ints, frames: Ints) -> tuple[Ints, Ints]:
     wanted = np.concatenate(numbers)
     whole, part = np.interp(wanted, frames, stamps - stamps[0]), stamps[0]
     return np.rint(whole).astype(np.int64) + part, wanted
+
+
+def without_clock_steps(messages: list[pb.Observation], file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
+    """The messages on the longer side of a step of their camera's clock, as `calibrate` takes it; and warnings.
+
+    A clock that was set back is told by the frames' numbers, if these increase.
+
+    Raises InputError where the frames of all cameras are too far apart.
+    """
+    kept = set[int]()
+    intervals: list[float] = []
+    warnings = []
+    for camera in dict.fromkeys(message.camera for message in messages):
+        mine = sorted((m for m in messages if m.camera == camera), key=lambda one: (one.frame, one.device_time_ns))
+        times = np.array([message.device_time_ns for message in mine]) / NANOSECONDS
+        back = np.flatnonzero(np.diff(times) < 0.0)
+        if len(back) != 1 or times[back[0] + 1] < times[0]:  # no clock set back once, but numbers in another order
+            back, mine, times = back[:0], sorted(mine, key=lambda one: one.device_time_ns), np.sort(times)
+        gaps = np.diff(times)
+        intervals += [float(np.median(gaps))] if len(gaps) else []
+        steps = np.union1d(back, np.flatnonzero(gaps > MAX_PAUSE_S))
+        part = max(np.split(np.arange(len(mine)), steps + 1), key=len)
+        kept |= {id(mine[i]) for i in part.tolist()}
+        if len(part) < len(mine):
+            left = f"{len(mine) - len(part)} of {len(mine)} frames on the other side are left out"
+            warnings.append(f"{camera}: its clock steps by {max(gaps[steps], key=abs):.0f} s; {left}")
+    if min(intervals, default=0.0) > _MAX_INTERVAL_S:
+        what = f"frames are {min(intervals):.4g} s apart, over which nobody is followed"
+        raise InputError(what, file=file, remedy="give times in seconds, not in milliseconds or another unit")
+    return [one for one in messages if id(one) in kept], tuple(warnings)
 
 
 def followed_detections(

@@ -7,15 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from deploy.offline.follow.calibration import GivenCalibration, read_given_calibration
 from deploy.offline.follow.objects import (
-    BOXES_FILE,
     Kind,
     followed_detections,
     object_messages,
     read_objects,
+    without_clock_steps,
 )
 from deploy.offline.follow.units import check_units
 from deploy.offline.progress import Progress
@@ -27,15 +25,13 @@ from protocols.core.ranges import MAX_CLOCK_RATE, MAX_TIME_NS, MIN_CLOCK_RATE
 from protocols.log.read.reader import LogReader
 from protocols.log.read.session import is_log
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE
+from protocols.session.folder import BOXES_FILE, OBSERVATIONS_FILE, RIG_FILE
 from protocols.session.rig import read_rig
 from protocols.topics import OBSERVATION
 
 LOG_OF_VIDEOS = "detections.mcap"
 _SAME_TIME_NS = NANOSECONDS
 """Cameras at 1 Hz need not have their frames at one time."""
-_MAX_INTERVAL_S = 10.0
-"""Between frames. Nobody is followed over so long; 60 frames a second in milliseconds seem 16.7 s apart."""
 _MAX_ROWS = 2_000_000
 """Reference times at which tracks are wanted: 18 h at 30 Hz."""
 
@@ -110,7 +106,7 @@ def read_follow_input(
             videos = {video.camera: video.path for video in list_videos(session)[0]}
         if session.is_dir() and (session / RIG_FILE).exists():
             shared |= read_rig(session / RIG_FILE).shared_clock
-    messages, steps = _without_clock_steps(messages, file or session)
+    messages, steps = without_clock_steps(messages, file or session)
     found, left_out = followed_detections(messages, kind, known.sizes)
     warnings = (*warnings, *more, *steps, *left_out.warnings)
     unused = sorted({message.camera for message in messages} - known.sizes.keys())
@@ -163,32 +159,8 @@ def check_log(file: Path, calibration: Path) -> tuple[str, ...]:
     """Warnings about the people in a log as `follow` gives them. Raises InputError where they contradict the units,
     pictures, poses or vertical of a calibration.toml."""
     known = read_given_calibration(calibration)
-    found, _ = followed_detections(_without_clock_steps(_read_log(file)[0], file)[0], "person", known.sizes)
+    found, _ = followed_detections(without_clock_steps(_read_log(file)[0], file)[0], "person", known.sizes)
     return check_units(found, known, "person", file) if any(message.detections for message in found) else ()
-
-
-def _without_clock_steps(messages: list[pb.Observation], file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
-    """The messages on the longer side of a step of their camera's clock, as `calibrate` takes it; and warnings.
-
-    Raises InputError where the frames of all cameras are too far apart.
-    """
-    kept: dict[str, tuple[int, int]] = {}
-    intervals: list[float] = []
-    warnings = []
-    for camera in dict.fromkeys(message.camera for message in messages):
-        times = np.sort([message.device_time_ns for message in messages if message.camera == camera])
-        gaps = np.diff(times / NANOSECONDS)
-        intervals += [float(np.median(gaps))] if len(gaps) else []
-        part = max(np.split(times, np.flatnonzero(gaps > MAX_PAUSE_S) + 1), key=len)
-        kept[camera] = int(part[0]), int(part[-1])
-        if len(part) < len(times):
-            left = f"{len(times) - len(part)} of {len(times)} frames on the other side are left out"
-            warnings.append(f"{camera}: its clock steps by {gaps.max():.0f} s; {left}")
-    if min(intervals, default=0.0) > _MAX_INTERVAL_S:
-        what = f"frames are {min(intervals):.4g} s apart, over which nobody is followed"
-        raise InputError(what, file=file, remedy="give times in seconds, not in milliseconds or another unit")
-    left_in = [one for one in messages if kept[one.camera][0] <= one.device_time_ns <= kept[one.camera][1]]
-    return left_in, tuple(warnings)
 
 
 def _reference_times(messages: list[pb.Observation], known: GivenCalibration) -> dict[str, set[int]]:

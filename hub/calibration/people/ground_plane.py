@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Ints
 
 _MIN_BODIES = 40  # as many as an angle of 1 degree needs with heights of 5 % (std) in one half of a picture
 _SPREAD = 0.05  # log size: people differ by 4 %, boxes by 3 %; the scale of the robust loss
+_HEIGHTS_STD = 0.1  # log height of somebody, where each body's person is known: adults; the loss lets children be
 _MAX_SPREAD = 0.25  # of log size, robust std: beyond, what is seen are no upright people on one plane
 _MAX_ANGLE_STD = np.deg2rad(3.0)
 """Of the vertical: people in one place of the picture tell a size, not how it grows. From 3 degrees on, a ground point
@@ -60,8 +61,11 @@ class GroundPlane:
         return rays[:, :2] * (self.height / np.where(below, -rays[:, 2], np.inf))[:, None], below
 
 
-def estimate_ground_plane(bodies: Bodies) -> GroundPlane | None:
-    """The ground plane on which bodies of one height stand; None where they do not determine it."""
+def estimate_ground_plane(bodies: Bodies, person: Ints | None = None) -> GroundPlane | None:
+    """The ground plane on which bodies of one height stand; None where they do not determine it.
+
+    person: (n,) whose body each one is, from 0: then each person has a height, and the mean is of people.
+    """
     from scipy.optimize import least_squares  # a quarter of a second to import, which markers do not need
 
     if len(bodies.top) < _MIN_BODIES:
@@ -69,19 +73,28 @@ def estimate_ground_plane(bodies: Bodies) -> GroundPlane | None:
     size = bodies.bottom - bodies.top
 
     def residuals(x: Floats) -> Floats:
-        """Log of predicted over observed size. x: slopes of the vertical, log height of people over the camera's."""
+        """Log of predicted over observed size, and heights. x: slopes of the vertical, log height of people over the
+        camera's, log of each one's over that."""
         up = np.array([x[0], -1.0, x[1]]) / np.sqrt(1.0 + x[0] ** 2 + x[1] ** 2)
         foot = np.column_stack([bodies.ends(up)[1], np.ones(len(size))])
         down = -foot @ up
         below = down > _HORIZON
-        head = foot / np.where(below, down, 1.0)[:, None] + np.exp(x[2]) * up
+        tall = np.exp(x[2] + np.append(x[3:], 0.0)[whose])
+        head = foot / np.where(below, down, 1.0)[:, None] + tall[:, None] * up
         above = bodies.bottom - head[:, 1] / np.maximum(head[:, 2], _HORIZON)
-        return np.where(below & (above > 0.0), np.log(np.maximum(above, 1e-6) / size), 20.0 * _SPREAD)
+        errors = np.where(below & (above > 0.0), np.log(np.maximum(above, 1e-6) / size), 20.0 * _SPREAD)
+        return np.append(errors, _SPREAD / _HEIGHTS_STD * x[3:])
 
+    whose = np.full(len(size), -1)
     starts = [np.array([0.0, tilt, np.log(height)]) for tilt in _TILTS for height in _HEIGHTS]
+    if person is not None:
+        if (plain := estimate_ground_plane(bodies)) is None:
+            return None
+        whose, slopes = person, -plain.up[[0, 2]] / plain.up[1]
+        starts = [np.array([*slopes, -np.log(plain.height), *np.zeros(person.max() + 1)])]
     found = [least_squares(residuals, start, loss="cauchy", f_scale=_SPREAD, max_nfev=50) for start in starts]
     best = min(found, key=lambda one: float(one.cost))
-    errors = residuals(best.x)
+    errors = residuals(best.x)[: len(size)]
     spread = 1.4826 * float(np.median(np.abs(errors)))
     jacobian = np.asarray(best.jac)
     information = jacobian.T @ jacobian / max(spread, 1e-3) ** 2

@@ -7,14 +7,14 @@ clocks are independent, this is done for each lag of a grid.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from protocols.geometry.types import Floats, Ints
 
 _INTERVAL_S = 0.4  # between instants: in less nobody moves out of their place
-_MOST_INSTANTS = 150  # spread over the recording
+_MOST_INSTANTS = 150  # spread over what two recordings have in common at a lag
 _HYPOTHESES = 20_000  # of one lag; of many lags a fifth each, which votes as clearly (seven real cameras, 21 pairs)
 _MOST_PAIRS = 400  # of people in one frame, of each camera: all of 20 people; their product is held in memory
 _MOST_LAGS, _COARSE_INSTANTS, _COARSE = 120, 40, 1_000  # lags that are tried in full, after a coarse search of more
@@ -40,23 +40,17 @@ solutions are wrong, 1.1."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundPoints:
-    """Who stands where, by frame. time: (n,) [s], ascending, on the camera's clock. places: n arrays (k, 2). most: of
-    the instants that are used."""
+    """Who stands where, by frame. time: (n,) [s], ascending, on the camera's clock. places: n arrays (k, 2). instants:
+    frames with two people or more, an interval apart."""
 
     time: Floats
     places: list[Floats]
-    most: int = _MOST_INSTANTS
+    instants: Ints = field(init=False)
 
-    def instants(self) -> Ints:
-        """Frames with two people or more, an interval apart and spread over the recording."""
-        crowded = np.array([len(one) >= 2 for one in self.places], dtype=np.bool_)
-        index = np.flatnonzero(crowded)
-        if not len(index):
-            return index
-        slot = np.floor((self.time[index] - self.time[index[0]]) / _INTERVAL_S + 1e-6)
-        index = index[np.unique(slot, return_index=True)[1]]
-        spread = np.linspace(0, len(index) - 1, min(len(index), self.most)).round().astype(np.int64)
-        return np.asarray(index[np.unique(spread)])
+    def __post_init__(self) -> None:
+        index = np.flatnonzero([len(one) >= 2 for one in self.places])
+        slot = np.floor((self.time[index] - self.time[index[:1]]) / _INTERVAL_S + 1e-6)
+        object.__setattr__(self, "instants", index[np.unique(slot, return_index=True)[1]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,8 +109,8 @@ def register(a: GroundPoints, b: GroundPoints, lags: Floats, rng: np.random.Gene
     lags: that are tried. rng: picks hypotheses.
     """
     if len(lags) > _MOST_LAGS:  # of a long recording: few instants and hypotheses tell the likely ones
-        few = replace(a, most=_COARSE_INSTANTS)
-        most = [max((one.meetings for one in _at_lag(few, b, lag, _COARSE, rng)), default=0) for lag in lags.tolist()]
+        few = [_at_lag(a, b, lag, _COARSE, rng, _COARSE_INSTANTS) for lag in lags.tolist()]
+        most = [max((one.meetings for one in found), default=0) for found in few]
         lags = lags[np.sort(np.argsort(most, kind="stable")[-_MOST_LAGS:])]
     budget = _HYPOTHESES if len(lags) == 1 else _HYPOTHESES // 5
     solutions = [one for lag in lags.tolist() for one in _at_lag(a, b, lag, budget, rng)]
@@ -159,16 +153,16 @@ def _same(one: Registration, other: Registration) -> bool:
     return near and abs(one.lag - other.lag) < _SAME_S
 
 
-def _common(a: GroundPoints, b: GroundPoints, lag: float) -> list[tuple[Floats, Floats]]:
-    """Places of both cameras at instants of a, b's between its frames."""
-    index = a.instants()
-    wanted = a.time[index] - lag
+def _common(a: GroundPoints, b: GroundPoints, lag: float, most: int = _MOST_INSTANTS) -> list[tuple[Floats, Floats]]:
+    """Places of both cameras at instants of a, b's between its frames; ``most`` instants of all that they share."""
+    wanted = a.time[a.instants] - lag
     if len(b.time) < 2:
         return []
-    inside = (wanted >= b.time[0]) & (wanted <= b.time[-1])
+    inside = np.flatnonzero((wanted >= b.time[0]) & (wanted <= b.time[-1]))
+    inside = inside[np.unique(np.linspace(0, len(inside) - 1, min(len(inside), most)).round().astype(np.int64))]
     after = np.searchsorted(b.time, wanted[inside]).clip(1, len(b.time) - 1)
     out = []
-    for i, j, time in zip(index[inside].tolist(), after.tolist(), wanted[inside].tolist(), strict=True):
+    for i, j, time in zip(a.instants[inside].tolist(), after.tolist(), wanted[inside].tolist(), strict=True):
         span, before = b.time[j] - b.time[j - 1], time - b.time[j - 1]
         if span > _LONGEST_SPAN_S and min(before, span - before) > _FINE_LAG_S:
             continue
@@ -188,11 +182,13 @@ def _between(first: Floats, second: Floats, share: float) -> Floats:
     return np.where(same[:, None], nearer + share * (other[nearest] - nearer), nearer)
 
 
-def _at_lag(a: GroundPoints, b: GroundPoints, lag: float, budget: int, rng: np.random.Generator) -> list[Registration]:
+def _at_lag(
+    a: GroundPoints, b: GroundPoints, lag: float, budget: int, rng: np.random.Generator, instants: int = _MOST_INSTANTS
+) -> list[Registration]:
     """The best-voted registrations at one lag, with their meetings."""
     from scipy.spatial import cKDTree
 
-    common = _common(a, b, lag)
+    common = _common(a, b, lag, instants)
     if not common:
         return []
     parts = [_hypotheses(p, q, max(budget // len(common), 1), rng) for p, q in common if len(q) >= 2]

@@ -13,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from hub.bundle.initialisation import Reconstruction, triangulate_and_adjust
+from hub.bundle.model_comparison import LENS, refuted_lenses
 from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
 from hub.calibration.final_adjustment import final_adjustment
 from hub.calibration.pairs.pair_network import Progress
-from hub.calibration.people import END_STD
+from hub.calibration.people import END_STD, MIN_INTERVAL_NS
 from hub.calibration.people.ground_plane import Bodies, GroundPlane, estimate_ground_plane
 from hub.calibration.people.registration import GroundPoints, Registration, lag_grid, register, rotation
 from hub.calibration.result import assemble_calibration
@@ -44,7 +45,6 @@ _KNOWN_LAG_S = 1.0  # about a lag that other pairs give
 _ONE_COLUMN_PX = 0.5  # the middles of a box's top and bottom, while a body is seen along the vertical
 _ROWS_OF_PERSON = 12  # in all cameras: fewer are too short a path to be worth two points
 _INITIAL_RMS_PX, _INITIAL_LAG_STD_S = 5.0, 0.1  # of the registration, for the tracker
-_INTERVAL_S = 0.09  # of the frames that are used, at least: with half as many, paths that turn bias clocks by 20 ms
 _MAX_LEAN_DEG, _MIN_WIDTH = 1.5, 0.1
 """Between the verticals of the pictures and of the plane in which heads and feet move: 0.2 to 0.7 degrees in ten rigs,
 also on a slope of 10 % and with a step of 0.6 m; 2.5 with lenses 22 % off. And the width over the length of where
@@ -92,7 +92,7 @@ def calibrate_people(
         raise Refused(reason, {name: refused.get(name, reason) for name in rig.cameras})
     report("following people", 0.5)
     initial = {name: _initial(name, rig, planes[name], found) for name, found in placed.items()}
-    observations = _labelled(rig, messages, initial)
+    observations = _labelled(rig, messages, initial, planes)
     bars = [bar for bar in rig.scale_bars if bar[:2] == ("head", "foot")]
     rig = replace(rig, metadata=rig.metadata | {"target": "person"})
     prepared = prepare(rig, observations)
@@ -133,15 +133,27 @@ def calibrate_people(
         rig = replace(rig, distances=(*rig.distances, (a, b, apart * bars[0][2] / STATURE_M)))
     found = assemble_calibration(rig, solution)
     _check_upright(found, planes)
-    return found, observations
+    return replace(found, warnings=(*found.warnings, *_contradictions(solution.reconstruction))), observations
+
+
+def _contradictions(reconstruction: Reconstruction) -> tuple[str, ...]:
+    """A warning where the people refute a focal length: it is wrong, or boxes of one camera are of another length."""
+    refuted = refuted_lenses(reconstruction.problem, reconstruction.state, LENS[:1])
+    if not refuted:
+        return ()
+    worst = refuted[0]
+    name, change, std = reconstruction.names[worst.camera], worst.change[0], np.sqrt(worst.covariance[0, 0])
+    return (
+        f"{name}: its people contradict the others' as if its focal length were {100 * change:+.1f} % ± "
+        f"{100 * std:.1f} % off: a camera's lens is wrong, or its boxes are longer or shorter than the others', or it "
+        "looks steeply down; positions may be off by more than their stds",
+    )
 
 
 def _check_upright(found: Calibration, planes: Mapping[str, GroundPlane]) -> None:
-    """Raise Refused where the vertical of each picture is not that of the plane in which heads, or feet, move."""
-    ends = {"head": list[Floats](), "foot": list[Floats]()}
-    for table in found.trajectories:
-        ends[table.label.rpartition("-")[2]].append(table.position[np.isfinite(table.position).all(axis=1)])
-    levels = [np.concatenate(one) - np.median(np.concatenate(one), axis=0) for one in ends.values() if one]
+    """Raise Refused where the vertical of each picture is not that of the plane in which each head, or foot, moves."""
+    paths = [table.position[np.isfinite(table.position).all(axis=1)] for table in found.trajectories]
+    levels = [path - np.median(path, axis=0) for path in paths if len(path)]  # of children, too
     spread, axes = np.linalg.svd(np.concatenate(levels), full_matrices=False)[1:]
     if spread[1] < _MIN_WIDTH * spread[0]:  # all on one line: no plane
         return
@@ -157,10 +169,10 @@ def _check_upright(found: Calibration, planes: Mapping[str, GroundPlane]) -> Non
 
 
 def _thinned(messages: Sequence[pb.Observation]) -> list[pb.Observation]:
-    """Frames of each camera that are at least `_INTERVAL_S` apart, in the order of their times."""
+    """Frames of each camera that are at least `MIN_INTERVAL_NS` apart, in the order of their times."""
     kept, last = list[pb.Observation](), dict[str, int]()
     for one in sorted(messages, key=lambda one: one.device_time_ns):
-        if one.camera not in last or one.device_time_ns - last[one.camera] >= _INTERVAL_S * NANOSECONDS:
+        if one.camera not in last or one.device_time_ns - last[one.camera] >= MIN_INTERVAL_NS:
             kept.append(one)
             last[one.camera] = one.device_time_ns
     return kept
@@ -249,8 +261,13 @@ def _initial(name: str, rig: Rig, plane: GroundPlane, found: Registration) -> Ca
     return CameraCalibration(name, lens, pose, TimeMap(1.0, found.lag), std, np.zeros(3), _INITIAL_RMS_PX)
 
 
-def _labelled(rig: Rig, messages: Sequence[pb.Observation], initial: dict[str, CameraCalibration]) -> Observations:
-    """Heads and feet of everybody who is followed in two cameras or more, as ``person1-head``, ``person1-foot``, …"""
+def _labelled(
+    rig: Rig, messages: Sequence[pb.Observation], initial: dict[str, CameraCalibration], planes: dict[str, GroundPlane]
+) -> Observations:
+    """Heads and feet of everybody who is followed in two cameras or more, as ``person1-head``, ``person1-foot``, …
+
+    planes: become those of people who differ in height.
+    """
     up = np.array([0.0, 0.0, 1.0])
     start = Calibration(initial, next(iter(initial)), "metric", "m", "", "")
     seen = [one for one in messages if one.camera in initial]
@@ -260,27 +277,29 @@ def _labelled(rig: Rig, messages: Sequence[pb.Observation], initial: dict[str, C
     by_key = {(one.camera, one.sequence): one for one in seen}
     of_boxes = _cameras_of_boxes(seen)
     hidden = _touching([one for one in seen if one.camera not in of_boxes], initial, followed.tracks, up)
-    names, labels, frames, moments, pixels, stds = [], [], [], [], [], []
+    bodies: dict[str, list[tuple[int, int, pb.Detection, Bodies]]] = {name: [] for name in initial}
     for track in followed.tracks:
         if len({name for name, _, _ in track.detections}) < 2 or len(track.detections) < _ROWS_OF_PERSON:
             continue
         for name, sequence, index in track.detections:
-            message, camera = by_key[name, sequence], initial[name]
-            one = message.detections[index]
-            if not (one.head and one.foot):
-                continue
-            body = _normalised(np.array([[*one.head, *one.foot]]), camera.intrinsics)
-            if not len(body.top):
-                continue
+            one = by_key[name, sequence].detections[index]
+            if one.head and one.foot:
+                body = _normalised(np.array([[*one.head, *one.foot]]), initial[name].intrinsics)
+                bodies[name] += [(track.id, sequence, one, body)] if len(body.top) else []
+    names, labels, frames, moments, pixels, stds = [], [], [], [], [], []
+    for name, found in bodies.items():
+        planes[name] = _of_people([(person, body) for person, _, _, body in found]) or planes[name]
+        for person, sequence, one, body in found:
+            message, lens = by_key[name, sequence], initial[name].intrinsics
             ends, shares = np.array([one.head, one.foot]), [END_STD["head"]]
             if name in of_boxes:
-                ends = camera.intrinsics.project_normalised(body.ends(camera.pose.rotation @ up)[:, 0])
+                ends = lens.project_normalised(body.ends(planes[name].up)[:, 0])
                 shares = [_BOX_STD, _BOX_STD]
-            elif track.id in hidden.get((name, sequence), ()):
+            elif person in hidden.get((name, sequence), ()):
                 continue
             for end, pixel, share in zip(("head", "foot"), ends, shares, strict=False):
                 names.append(name)
-                labels.append(f"person{track.id}-{end}")
+                labels.append(f"person{person}-{end}")
                 frames.append(message.frame)
                 moments.append(message.device_time_ns / NANOSECONDS)
                 pixels.append(pixel)
@@ -308,6 +327,17 @@ def _cameras_of_boxes(messages: Sequence[pb.Observation]) -> set[str]:
         bodies = [abs(one.head[0] - one.foot[0]) for one in message.detections if one.head and one.foot]
         columns.setdefault(message.camera, []).extend(bodies)
     return {name for name, one in columns.items() if one and float(np.median(one)) < _ONE_COLUMN_PX}
+
+
+def _of_people(bodies: Sequence[tuple[int, Bodies]]) -> GroundPlane | None:
+    """The ground plane by bodies of one camera, each of a person with a number; None where they do not determine it."""
+    if not bodies:
+        return None
+    centre, top, bottom = (
+        np.concatenate([getattr(body, part) for _, body in bodies]) for part in ("centre", "top", "bottom")
+    )
+    person = np.unique([number for number, _ in bodies], return_inverse=True)[1]
+    return estimate_ground_plane(Bodies(centre, top, bottom), person)
 
 
 def _touching(

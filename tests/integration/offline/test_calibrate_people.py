@@ -9,8 +9,10 @@ import pytest
 import tomli_w
 
 from deploy.cli import run
-from deploy.offline.people_session import people_session
+from deploy.offline.people_session import people_session, read_people
 from deploy.offline.single_target import rows_of_unlabelled_people
+from protocols import load_session
+from protocols.core.errors import InputError
 from tests.support import crowds
 
 OFFSETS = {"left": 0.0, "right": -37.3, "back": 1200.85}
@@ -40,6 +42,41 @@ def test_boxes_without_labels_calibrate_and_are_then_followed(tmp_path: Path) ->
     assert run([*followed, "--json"]) == 0
     tracks = json.loads((tmp_path / "f" / "result.json").read_text(encoding="utf-8"))["tracks"]
     assert len(tracks) == 3
+
+
+def test_of_many_frames_only_those_that_are_used_become_messages(tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "crowd", "boxes.csv", crowds.boxes_csv(4.0, 30.0, OFFSETS))
+    _, people, _ = read_people(folder / "boxes.csv", folder / "rig.toml")
+    assert len(people) == 3 * 40
+
+
+def test_a_clock_that_was_set_back_is_used_on_the_longer_side(tmp_path: Path) -> None:
+    lines = crowds.boxes_csv(12.0, 5.0, OFFSETS).splitlines()
+    for row, line in enumerate(lines):
+        camera, frame, time, rest = line.split(",", 3)
+        if camera == "right" and int(frame) >= 40:
+            lines[row] = f"{camera},{frame},{float(time) - 2.1},{rest}"
+    folder = write_session(tmp_path / "crowd", "boxes.csv", "\n".join(lines))
+    _, people, warnings = read_people(folder / "boxes.csv", folder / "rig.toml")
+    assert "right: its clock steps by -2 s; 20 of 60 frames on the other side are left out" in warnings
+    assert sum(one.camera == "right" for one in people) == 40
+
+
+def test_what_needs_labels_says_what_boxes_are_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_session(tmp_path / "crowd", "boxes.csv", crowds.boxes_csv(4.0, 5.0))
+    known = crowds.write_calibration(tmp_path / "calibration.toml")
+    assert run(["triangulate", str(folder), "--calibration", str(known), "--out", str(tmp_path / "a.csv")]) == 2
+    assert "syncline follow" in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"no observations\.csv, but boxes\.csv"):
+        load_session(folder)
+    assert run(["info", str(folder), "--json"]) == 0
+    cameras = json.loads(capsys.readouterr().out)["cameras"]
+    assert {name: (one["rows"], one["labels"], one["end"]) for name, one in cameras.items()} == {
+        name: (60, [], 3.8) for name in crowds.NAMES
+    }
+    session = people_session(folder, None)
+    assert session is not None
+    assert len(session.people) == 60
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hub.calibration.people.unlabelled import calibrate_people
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
 from protocols.geometry import so3
+from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
@@ -45,6 +47,23 @@ def test_sizes_of_upright_people_give_the_vertical_and_the_cameras_height(name: 
     pose = crowds.poses()[name]
     assert np.rad2deg(np.arccos(found.up @ pose.rotation[:, 2])) < 1.0
     assert found.height * crowds.HEIGHT == pytest.approx(pose.position[2], rel=0.04)
+
+
+def test_children_among_adults_turn_no_vertical_where_it_is_known_who_is_who() -> None:
+    rng = np.random.default_rng(2)
+    person = rng.integers(0, 6, 300)
+    feet = np.column_stack([rng.uniform(-4.0, 4.0, (300, 2)), np.zeros(300)])
+    feet[:, 1] += np.where(person < 3, 1.5, -1.5)  # the children play in one part of the picture
+    tall = np.column_stack([np.zeros((300, 2)), np.where(person < 3, 1.15, 1.72)])
+    pose = crowds.poses()["left"]
+    head, foot = (
+        crowds.lens().unproject(crowds.lens().project(pose.camera_from_world(at))) for at in (feet + tall, feet)
+    )
+    noise = 0.03 * (foot - head)[:, 1] * rng.normal(size=(2, 300))
+    both = Bodies(0.5 * (head + foot), head[:, 1] + noise[0], foot[:, 1] + noise[1])
+    found = estimate_ground_plane(both, person)
+    assert found is not None
+    assert np.rad2deg(np.arccos(found.up @ pose.rotation[:, 2])) < 1.0
 
 
 def test_people_in_one_place_give_no_ground() -> None:
@@ -82,6 +101,19 @@ def test_registration_finds_rotation_shift_and_lag() -> None:
     assert found.lag == pytest.approx(lag, abs=0.1)
     assert abs(np.angle(np.exp(1j * (found.angle - angle)))) < 0.02
     assert found.shift == pytest.approx(shift, abs=0.15)
+
+
+def test_recordings_that_share_a_small_part_of_them_are_registered_by_all_of_it() -> None:
+    time, places = walkers(3, 5, 218.0, fps=2.5)
+    rng, half = np.random.default_rng(1), 300
+    noise = rng.normal(0.0, 0.08, (2, *places.shape))
+    a = GroundPoints(time[:half], list((places + noise[0])[:half]))
+    b = GroundPoints(time[-half:] - 12.3, list((places + noise[1])[-half:] @ rotation(2.0)))
+    lags = lag_grid(a, b, 20.0)
+    found = register(a, b, lags[np.abs(lags - 12.3) < 35.0], np.random.default_rng(0))
+    assert found is not None
+    assert found.lag == pytest.approx(12.3, abs=0.1)
+    assert found.meetings > 200  # of five people at 55 instants in 22 s
 
 
 def test_other_people_are_no_registration() -> None:
@@ -139,6 +171,15 @@ def test_unlabelled_people_calibrate_cameras_that_share_no_clock() -> None:
         assert camera.lag_std < 0.01
     assert {label.rpartition("-")[2] for label in observations.labels} == {"head", "foot"}
     assert found.scale == "arbitrary"
+    assert not any("focal length" in warning for warning in found.warnings)
+
+
+def test_a_wrong_lens_is_warned_of() -> None:
+    rig, messages = session(40.0, OFFSETS)
+    matrix = np.diag([1.1, 1.1, 1.0]) @ crowds.lens().matrix + np.outer([-48.0, -36.0, 0.0], [0.0, 0.0, 1.0])
+    rig.cameras["back"] = replace(rig.cameras["back"], intrinsics=Intrinsics(*crowds.SIZE, matrix))
+    found, _ = calibrate_people(rig, messages)
+    assert any("as if its focal length were" in warning for warning in found.warnings)
 
 
 def test_cameras_that_are_apart_on_a_shared_clock_are_refused() -> None:
