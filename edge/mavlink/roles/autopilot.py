@@ -317,7 +317,10 @@ class Autopilot:
                 GIMBAL,
             )
         elif kind == "GIMBAL_MANAGER_STATUS" and now.ned_from_gimbal is not None:
-            yield mavlink.MAVLink_gimbal_manager_status_message(boot_ms, 0, GIMBAL, *self._gimbal_holder, 0, 0), AUTOPILOT
+            yield (
+                mavlink.MAVLink_gimbal_manager_status_message(boot_ms, 0, GIMBAL, *self._gimbal_holder, 0, 0),
+                AUTOPILOT,
+            )
 
     def _send(self, message: Any, part: int) -> None:
         codec = self._codecs[part]

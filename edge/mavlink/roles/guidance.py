@@ -72,7 +72,9 @@ class Guidance:
     def handle_gimbal_status(self, status: Any, now_s: float) -> None:
         """Take a GIMBAL_MANAGER_STATUS of the vehicle: who took the gimbal keeps it, until it is free again."""
         system, component = status.primary_control_sysid, status.primary_control_compid
-        holder = _OWN if (system, component) == (self._link.system, CAMERA) else f"system {system}" if system else _NOBODY
+        holder = (
+            _OWN if (system, component) == (self._link.system, CAMERA) else f"system {system}" if system else _NOBODY
+        )
         if int(status.flags) & mavlink.GIMBAL_MANAGER_FLAGS_RC_EXCLUSIVE:
             holder = "remote control"
         self._holders[status.gimbal_device_id] = holder
