@@ -113,7 +113,11 @@ class TargetEstimator:
             down = float((sample.ned_from_body @ self._mounting @ ray)[2])
             if np.isfinite(down) and down > 1e-3 and sample.position[2] < -2.0:
                 side = float(
-                    np.clip(_DEFAULT_BOX_M * self._lens.focal * down / -sample.position[2], _LEAST_BOX_PX, 0.5 * self._size[1])
+                    np.clip(
+                        _DEFAULT_BOX_M * self._lens.focal * down / -sample.position[2],
+                        _LEAST_BOX_PX,
+                        0.5 * self._size[1],
+                    )
                 )
         return Box(x - 0.5 * side, y - 0.5 * side, side, side)
 
