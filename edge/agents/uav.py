@@ -141,7 +141,9 @@ class UavAgent:
         now = self._now_ns()
         self._vehicle.tick(now)
         for message in received:
-            if message.system == self._link.vehicle:
+            if message.system == self._link.vehicle and message.kind == "GIMBAL_MANAGER_STATUS":
+                self._control.handle(message, now / NANOSECONDS)
+            elif message.system == self._link.vehicle:
                 for sample in self._vehicle.handle(message):
                     self._take_sample(sample)
             self.camera.handle(message, now / NANOSECONDS)
@@ -346,7 +348,7 @@ class UavAgent:
             x, y = command.left * width - 0.5, command.top * height - 0.5
             box = Box(x, y, (command.right - command.left) * width, (command.bottom - command.top) * height)
             if command.is_point:
-                box = self._detected_at(x, y) or self.estimator.box_around(x, y)
+                box = self._detected_at(x, y) or self.estimator.box_around(x, y, command.radius * width)
             message.box.extend((box.x, box.y, box.width, box.height))
         refused = self.estimator.refused
         self._publish(message)

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from edge.mavlink.link.connection import Link
+from edge.mavlink.dialect import AUTOPILOT
+from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.roles.camera import ArmFollow, CameraComponent
 from edge.mavlink.roles.guidance import Guidance, GuidanceTarget
 from edge.mavlink.roles.vehicle import Vehicle
@@ -30,6 +31,17 @@ class GuidanceControl:
         motion = self._vehicle.motion_at(now_s)
         self._guidance.begin(None if motion is None else motion[0])
         self._last_visible_s = now_s
+
+    def handle(self, received: ReceivedMessage, now_s: float) -> None:
+        """Take a GIMBAL_MANAGER_STATUS. Stations are told when the gimbal is left to another one, and free again."""
+        guidance = self._guidance
+        if received.component != AUTOPILOT or not guidance.limits.gimbal:
+            return
+        before = guidance.gimbal_taken_by
+        guidance.handle_gimbal_status(received.message, now_s)
+        if guidance.gimbal_taken_by != before:
+            taken = f"gimbal left to {guidance.gimbal_taken_by}" if guidance.gimbal_taken_by else "gimbal is free again"
+            self._camera.say(f"Syncline: {taken}")
 
     def stop(self) -> None:
         """The operator has stopped tracking."""

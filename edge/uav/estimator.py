@@ -31,6 +31,7 @@ _TELEMETRY_BUFFER = 200  # telemetry samples kept from before a target is select
 _PARTICLES_EVERY, _ROAD_EVERY = 6, 15  # frames
 _MAX_PARTICLES, _MAX_ROAD_POINTS = 100, 600  # that a message shows: enough for the operator's picture
 _DEFAULT_BOX_M = 5.5  # side of the box placed around a selected point where the height above ground is known
+_LEAST_BOX_PX = 8.0  # side of a box around a point: of less, too little is seen to follow
 _DEFAULT_BOX_PX = 40.0  # where it is not known: that car at 0.14 m a pixel
 
 
@@ -96,16 +97,27 @@ class TargetEstimator:
         self.estimate = self._in_vehicle_frame(self._tracker.handle_frame(image, device_time_ns / NANOSECONDS))
         return self._target_messages()
 
-    def box_around(self, x: float, y: float) -> Box:
-        """The box for a selected point (x, y) [px]: the size of a car where the height above ground is known."""
+    def box_around(self, x: float, y: float, radius: float = 0.0) -> Box:
+        """The box for a selected point (x, y) [px]: about its radius if that is not 0, else the size of a car.
+
+        A car's size follows from the height above ground, where that is known.
+        """
         side = _DEFAULT_BOX_PX
         sample = self._samples[-1] if self._samples else None
-        if sample is not None and sample.position is not None and self._lens is not None and self._mounting is not None:
+        if radius > 0.0:
+            side = float(np.clip(2.0 * radius, _LEAST_BOX_PX, 0.5 * self._size[1]))
+        elif (
+            sample is not None and sample.position is not None and self._lens is not None and self._mounting is not None
+        ):
             ray = np.append(self._lens.unproject(np.array([[x, y]]))[0], 1.0)
             down = float((sample.ned_from_body @ self._mounting @ ray)[2])
             if np.isfinite(down) and down > 1e-3 and sample.position[2] < -2.0:
                 side = float(
-                    np.clip(_DEFAULT_BOX_M * self._lens.focal * down / -sample.position[2], 8.0, 0.5 * self._size[1])
+                    np.clip(
+                        _DEFAULT_BOX_M * self._lens.focal * down / -sample.position[2],
+                        _LEAST_BOX_PX,
+                        0.5 * self._size[1],
+                    )
                 )
         return Box(x - 0.5 * side, y - 0.5 * side, side, side)
 

@@ -153,6 +153,7 @@ class Autopilot:
     def _reset(self) -> None:
         self._rates = dict(_DEFAULT_RATES)
         self._due: dict[str, float] = {}
+        self._gimbal_holder = (0, 0)  # system and component id of who may turn it
 
     def _apply_faults(self, time: float) -> None:
         if self._reboots and time >= self._reboots[0]:
@@ -205,7 +206,9 @@ class Autopilot:
             self._command(message)
         elif kind == "GIMBAL_MANAGER_SET_PITCHYAW":
             earth = bool(int(message.flags) & mavlink.GIMBAL_MANAGER_FLAGS_YAW_LOCK)
-            if math.isfinite(message.pitch) and math.isfinite(message.yaw):
+            if (message.get_srcSystem(), message.get_srcComponent()) != self._gimbal_holder:
+                self.counters["pointed.refused"] += 1
+            elif math.isfinite(message.pitch) and math.isfinite(message.yaw):
                 self.counters["pointed"] += 1
                 self._airframe.point_gimbal(self._now, message.pitch, message.yaw, earth)
         elif kind == "FOLLOW_TARGET" and message.get_srcSystem() != self.system:  # as ArduPilot: not its own
@@ -241,6 +244,8 @@ class Autopilot:
                     self._send(answer, part)
         elif message.command == mavlink.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE:
             result = mavlink.MAV_RESULT_ACCEPTED
+            if message.param1 >= 0:
+                self._gimbal_holder = int(message.param1), int(message.param2)
         answer = mavlink.MAVLink_command_ack_message(
             message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
         )
@@ -312,7 +317,10 @@ class Autopilot:
                 GIMBAL,
             )
         elif kind == "GIMBAL_MANAGER_STATUS" and now.ned_from_gimbal is not None:
-            yield mavlink.MAVLink_gimbal_manager_status_message(boot_ms, 0, GIMBAL, 0, 0, 0, 0), AUTOPILOT
+            yield (
+                mavlink.MAVLink_gimbal_manager_status_message(boot_ms, 0, GIMBAL, *self._gimbal_holder, 0, 0),
+                AUTOPILOT,
+            )
 
     def _send(self, message: Any, part: int) -> None:
         codec = self._codecs[part]

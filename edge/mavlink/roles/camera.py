@@ -89,6 +89,7 @@ class SelectTarget:
     """Command to track the target in a box or at a point.
 
     left, top, right, bottom: fractions of the image; both corners are equal for a point. by: the sender's system id.
+    radius: of a point, as a fraction of the image's width; 0 where none was given.
     """
 
     left: float
@@ -96,6 +97,7 @@ class SelectTarget:
     right: float
     bottom: float
     by: int
+    radius: float = 0.0
 
     @property
     def is_point(self) -> bool:
@@ -249,7 +251,8 @@ class CameraComponent:
             self._rates.set_interval((received.system, received.component), kind, p[1])
             return accepted
         if command == mavlink.MAV_CMD_CAMERA_TRACK_POINT:
-            selection = SelectTarget(p[0], p[1], p[0], p[1], received.system)
+            radius = p[2] if 0.0 < p[2] <= 1.0 else 0.0  # NaN is not
+            selection = SelectTarget(p[0], p[1], p[0], p[1], received.system, radius)
         elif command == mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE:
             selection = SelectTarget(
                 min(p[0], p[2]), min(p[1], p[3]), max(p[0], p[2]), max(p[1], p[3]), received.system

@@ -157,7 +157,7 @@ class CameraMessages:
         # Outside the image there is no box; the geo status reports the predicted position.
         if status.centre is not None and status.half_size is not None and all(0.0 <= c <= 1.0 for c in status.centre):
             (x, y), (w, h) = status.centre, status.half_size
-            radius = max(w, h)
+            radius = max(w, h * self._size[1] / self._size[0])  # of the image's width
             box = (max(x - w, 0.0), max(y - h, 0.0), min(x + w, 1.0), min(y + h, 1.0))
         elif status.state == "visible":
             # QGroundControl draws the box while the flags are ACTIVE alone, also one of NaN.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,9 @@ from edge.mavlink.settings import GuidanceLimits
 from edge.uav.navigation import Origin
 from protocols.geometry.types import Floats
 
-_CONFIGURE_S = 5.0  # between two claims of the gimbal
+_CONFIGURE_S = 5.0  # between two claims of the gimbal, where no manager says who controls it
+_CLAIM_TAKES_S = 2.0  # after which the manager's status, twice a second, shows the outcome of a claim
+_OWN, _NOBODY = "own", ""  # who controls a gimbal
 _MIN_HORIZONTAL_M = 3.0  # horizontal distance below which the bearing to the target is undefined
 _TARGET_HEIGHT_M = 0.7  # of a car's middle above the ground
 _NOT_ARMED = "follow is not armed"
@@ -42,13 +45,16 @@ class GuidanceTarget:
 class Guidance:
     """Sends guidance commands at ``rate_hz`` while allowed. hold_reason: why none are sent; "" while they are.
 
-    armed_by: the station that armed FOLLOW_TARGET for the present target; None while it is not armed.
+    armed_by: the station that armed FOLLOW_TARGET for the present target; None while it is not armed. gimbal_taken_by:
+    who took control of the gimbal since the target was selected, for whom it is left alone; "" while nobody has.
     """
 
     def __init__(self, link: Link, limits: GuidanceLimits, *, rate_hz: float = 10.0) -> None:
         self._link, self.limits = link, limits
         self._period = 1.0 / rate_hz
         self._due_s = self._configure_s = -math.inf
+        self._holders: dict[int, str] = {}  # by gimbal device
+        self._release()
         self._angles: tuple[float, float] | None = None
         self._start_position: Floats | None = None
         self.armed_by: int | None = None
@@ -57,10 +63,35 @@ class Guidance:
         self.hold_reason = "commands are off" if not (limits.gimbal or limits.follow) else "no target"
 
     def begin(self, vehicle: Floats | None) -> None:
-        """A target was selected while the vehicle was at a position (3,) NED [m]."""
+        """A target was selected while the vehicle was at a position (3,) NED [m]: the gimbal is claimed for it."""
+        self._release()
         self._start_position = None if vehicle is None else vehicle.copy()
         self._angles = None
         self.armed_by, self._disarmed = None, _NOT_ARMED
+
+    def handle_gimbal_status(self, status: Any, now_s: float) -> None:
+        """Take a GIMBAL_MANAGER_STATUS of the vehicle: who took the gimbal keeps it, until it is free again."""
+        system, component = status.primary_control_sysid, status.primary_control_compid
+        holder = (
+            _OWN if (system, component) == (self._link.system, CAMERA) else f"system {system}" if system else _NOBODY
+        )
+        if int(status.flags) & mavlink.GIMBAL_MANAGER_FLAGS_RC_EXCLUSIVE:
+            holder = "remote control"
+        self._holders[status.gimbal_device_id] = holder
+        holders = set(self._holders.values())  # of several gimbals only the first may be commanded
+        if _OWN in holders:
+            self._controls, self.gimbal_taken_by = True, ""
+        elif holders == {_NOBODY}:
+            if self._controls or self.gimbal_taken_by:
+                self._release()
+        elif self._controls or now_s - self._claimed_s > _CLAIM_TAKES_S:
+            # Before its claim has arrived, another one may still have it from an earlier use.
+            self._controls, self.gimbal_taken_by = False, max(holders)
+
+    def _release(self) -> None:
+        self._controls, self.gimbal_taken_by = False, ""
+        self._holders.clear()
+        self._claimed_s, self._configure_s = math.inf, -math.inf
 
     def arm(self, station: int) -> bool:
         """An operator allows FOLLOW_TARGET for the present target; whether the configuration does too."""
@@ -97,12 +128,13 @@ class Guidance:
         ahead = now_s - target.time_s
         position = target.position + float(np.clip(ahead, 0.0, 1.0)) * target.velocity
         reason = self._follow_refusal(position, vehicle) if limits.follow else "off"
-        if reason and not limits.gimbal:
-            self.hold(reason)
+        points = limits.gimbal and not self.gimbal_taken_by
+        if reason and not points:
+            self.hold(f"{self.gimbal_taken_by} controls the gimbal" if limits.gimbal else reason)
             return
         self.hold_reason = ""
         self._due_s = max(self._due_s + self._period, now_s + 0.5 * self._period)
-        if limits.gimbal:
+        if points:
             self._point(now_s, position, vehicle)
         if not reason and origin is not None:
             self._follow(now_s, position, target, origin)
@@ -135,8 +167,9 @@ class Guidance:
         return ""
 
     def _point(self, now_s: float, position: Floats, vehicle: Floats) -> None:
-        if now_s >= self._configure_s:
+        if now_s >= self._configure_s and not self._controls:
             self._configure_s = now_s + _CONFIGURE_S
+            self._claimed_s = min(self._claimed_s, now_s)
             vehicle_id, own, command = (
                 self._link.vehicle,
                 self._link.system,

@@ -176,6 +176,7 @@ class Vehicle:
             components = (GIMBAL, AUTOPILOT) if self._gimbal_source is None else (self._gimbal_source[0],)
             for component in components:
                 yield "GIMBAL_DEVICE_ATTITUDE_STATUS", self._rate_hz, component
+            yield "GIMBAL_MANAGER_STATUS", 2.0, AUTOPILOT
 
     def _command(self, command: int, component: int, *parameters: float) -> None:
         filled = [*parameters, *([0.0] * (7 - len(parameters)))]

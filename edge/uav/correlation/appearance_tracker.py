@@ -274,7 +274,8 @@ class AppearanceTracker:
 
     def _measured(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, float, float, Response]:
         """The target about a box: where, its similarity, the log likelihood ratio by it, filter, colour; the answer."""
-        box, answer = self._respond(image, box)
+        std = float(np.hypot(self._motion_filter.std, _SLIP_STD * self.length))
+        box, answer = self._respond(image, box, std)
         score = self._memory.score(image, box)
         ratio = self._memory.tracking_ratio(score) + answer.log_ratio
         ratio += _COLOUR_SHARE * self._colour.log_ratio(image, box)
@@ -308,12 +309,12 @@ class AppearanceTracker:
         self.box = box
         self._flow.remember(image, box)
 
-    def _respond(self, image: Image, box: OrientedBox) -> tuple[OrientedBox, Response]:
+    def _respond(self, image: Image, box: OrientedBox, std: float = np.inf) -> tuple[OrientedBox, Response]:
         """The box at the peak of the filter's answer; a second look where the first was off centre."""
-        answer = self._filter.respond(image, box)
+        answer = self._filter.respond(image, box, std)
         moved = box.at(box.centre + [answer.x, answer.y])
         if np.hypot(answer.x, answer.y) > 0.35 * np.sqrt(box.width * box.height):
-            again = self._filter.respond(image, moved)
+            again = self._filter.respond(image, moved, std)
             if again.peak > answer.peak:
                 return moved.at(moved.centre + [again.x, again.y]), again
         return moved, answer

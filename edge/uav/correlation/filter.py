@@ -105,14 +105,19 @@ class CorrelationFilter:
             share = np.float32(1.0 / self._count if self._count <= _FIRST_VIEWS else _FORGETTING)
             self._past = new * weights if self._past is None else (1 - share) * self._past + share * new * weights
 
-    def respond(self, image: Image, box: OrientedBox) -> Response:
-        """The answer in a window about a box, for a target of its size and angle."""
+    def respond(self, image: Image, box: OrientedBox, std: float = np.inf) -> Response:
+        """The answer in a window about a box, for a target of its size and angle; std: of its centre [image px].
+
+        The peak is that of the answer times the density of Student's t: one of its kind beside it may answer more.
+        """
         assert self._filter is not None
         assert self._past is not None
         spectrum = self._spectrum(image, box)
         product = (np.conj(self._filter) * spectrum * self._weights).sum(axis=0)
         answer = np.fft.fftshift(scipy.fft.irfft2(product, s=self._cells[::-1]))
-        row, column = divmod(int(answer.argmax()), answer.shape[1])
+        step = box.sides * self._window / np.array(self._cells)
+        squared = (self._dx[0] * step[0]) ** 2 + (self._dx[1] * step[1]) ** 2
+        row, column = divmod(int((answer / (1.0 + 0.5 * squared / std**2)).argmax()), answer.shape[1])
         peak = float(answer[row, column])
         away = np.maximum(
             np.abs(self._dx[0] - self._dx[0][row, column]), np.abs(self._dx[1] - self._dx[1][row, column])
@@ -122,7 +127,7 @@ class CorrelationFilter:
         near, other = float(past[away <= 1.5].max()), float(past[away > self._exclude].max())
         dx = self._dx[0][row, column] + refined(answer[row], column)
         dy = self._dx[1][row, column] + refined(answer[:, column], row)
-        offset = box.axes @ (np.array([dx, dy]) * box.sides * self._window / np.array(self._cells))
+        offset = box.axes @ (np.array([dx, dy]) * step)
         ratio, on = max(near, 0.0) / max(other, 1e-3), (self._on.mean, self._on.std)
         return Response(float(offset[0]), float(offset[1]), peak, ratio, on)
 

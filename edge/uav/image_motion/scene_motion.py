@@ -17,6 +17,7 @@ import numpy.typing as npt
 from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.ground.ego_motion import LK_WINDOW
 from edge.uav.ground.photometric import PhotometricGain
+from edge.uav.image_motion.burnt_in import BurntIn, shift, stood
 from protocols.geometry.types import Bools, Floats, Image
 
 Gray = npt.NDArray[np.uint8]
@@ -28,6 +29,7 @@ _BACKWARD_PX = 0.7  # forward-backward distance of a good track [px of the worki
 _RANSAC_PX = 1.5  # residual of a track of the static scene [px of the working image]
 _BENT = 0.04  # of the shift by a turn: mean of (x/f)^2 over half an image as wide as its focal length
 _MIN_TRACKS, _MIN_SHARE = 12, 0.35  # of a trusted motion: static tracks, and their share
+_MOST_STAND = 0.5  # share of the tracks off what seems burnt in, that move alike where it is
 _PARTS, _VOTE_PX = (4, 2), 2  # parts that are searched after a fast pan; agreement of their shifts [px, reduced]
 _PARALLAX_PX = 6.0  # largest correction [px of the working image]
 _PARALLAX_PRIOR = (1.0, 2.0, 2.0)  # tracks that say there is none, and that it does not grow
@@ -98,6 +100,7 @@ class SceneMotion:
         self._scale = max(1.0, size[0] / _WORKING_WIDTH)
         self._size = (round(size[0] / self._scale), round(size[1] / self._scale))
         self._gray: Gray | None = None
+        self._burnt_in = BurntIn(self._size)
         self.photometric = PhotometricGain(1)
         self._last = np.eye(2, 3)
         self.reach = _REACH * size[0]
@@ -111,6 +114,7 @@ class SceneMotion:
         if previous is None:
             self.photometric.update(gray, np.zeros((0, 2)), np.zeros((0, 2)))
             return STILL
+        plain, previous, gray = (previous, gray), self._filled(previous), self._filled(gray)
         corners = self._corners(previous, excluded)
         motion, gain = STILL, self.photometric.gain
         if len(corners) >= _MIN_TRACKS:
@@ -119,6 +123,10 @@ class SceneMotion:
                 like = _times(gray, cv2.mean(previous)[0] / max(cv2.mean(gray)[0], 1.0))
                 coarse = self._coarse_shift(previous, gray)
                 motion = max(motion, self._fit(*self._flow(previous, like, corners, coarse)), key=lambda one: one.share)
+        if not motion.trusted:
+            self._burnt_in.restart()
+        elif self._burnt_in.contradicts(gray, self._to_working(motion.matrix)):
+            motion = self._without_burnt_in(*plain, excluded, motion)
         self.photometric.update(gray, *self._working_tracks(motion))
         change = float((gain / self.photometric.gain)[0])
         if motion.trusted and abs(np.log(change)) > _BRIGHTER:
@@ -126,6 +134,23 @@ class SceneMotion:
             motion = max(motion, self._fit(*tracks), key=lambda one: one.share)
         self._last = self._to_working(motion.matrix) if motion.trusted else np.eye(2, 3)
         return motion
+
+    def _filled(self, gray: Gray) -> Gray:
+        return self._burnt_in.filled(gray, self._burnt_in.mask)
+
+    def _without_burnt_in(self, previous: Gray, gray: Gray, excluded: Floats | None, still: Motion) -> Motion:
+        """The motion that corners agree on which do not stand still; ``still`` where there is none."""
+        before = self._burnt_in.mask
+        self._burnt_in.mask = self._burnt_in.without(stood(*self._working_tracks(still)))
+        previous, gray = self._filled(previous), self._filled(gray)
+        corners = self._corners(previous, excluded)
+        for start in (self._last, self._coarse_shift(previous, gray)):
+            motion = self._fit(*self._flow(previous, gray, corners, start)) if len(corners) else STILL
+            moves = np.abs(shift(gray, self._to_working(motion.matrix))).max() > 1.0
+            if motion.trusted and motion.share > _MOST_STAND and moves:
+                return motion
+        self._burnt_in.mask = before
+        return still
 
     def _working_tracks(self, motion: Motion) -> tuple[Floats, Floats]:
         """Old and new positions (n, 2) of the static tracks in the working images; none where they are not trusted."""
@@ -135,7 +160,7 @@ class SceneMotion:
         return (motion.points + 0.5) / self._scale - 0.5, (moved + 0.5) / self._scale - 0.5
 
     def _corners(self, gray: Gray, excluded: Floats | None) -> npt.NDArray[np.float32]:
-        mask = np.full(gray.shape, 255, np.uint8)
+        mask = self._burnt_in.mask.copy()
         if excluded is not None and np.isfinite(excluded).all():
             x0, y0, x1, y1 = (int(v) for v in np.clip(excluded / self._scale, -10, 1e4))
             mask[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = 0

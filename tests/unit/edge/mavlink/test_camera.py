@@ -172,6 +172,14 @@ def test_a_rectangle_is_a_selection_whichever_corner_comes_first() -> None:
     ]
 
 
+@pytest.mark.parametrize(("given", "radius"), [(0.125, 0.125), (0.0, 0.0), (math.nan, 0.0), (-1.0, 0.0), (7.0, 0.0)])
+def test_a_point_may_have_a_radius(given: float, radius: float) -> None:
+    commands: list[OperatorCommand] = []
+    under_test = CameraUnderTest(on_command=lambda command: commands.append(command) or True)  # type: ignore[func-returns-value]
+    assert under_test.result(mavlink.MAV_CMD_CAMERA_TRACK_POINT, 0.5, 0.25, given) == mavlink.MAV_RESULT_ACCEPTED
+    assert commands == [SelectTarget(0.5, 0.25, 0.5, 0.25, 255, radius)]
+
+
 @pytest.mark.parametrize(
     "corners",
     [(0.1, 0.1, 1.2, 0.2), (math.nan, 0.1, 0.2, 0.2), (-0.1, 0.1, 0.2, 0.2), (0.5, 0.1, 0.5, 0.2), (0.5,) * 4],

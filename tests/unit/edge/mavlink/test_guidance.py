@@ -12,7 +12,7 @@ import pytest
 
 from edge.agents.uav_guidance import GuidanceControl
 from edge.mavlink.dialect import mavlink
-from edge.mavlink.link.connection import Link
+from edge.mavlink.link.connection import Link, ReceivedMessage
 from edge.mavlink.roles.guidance import Guidance, GuidanceTarget
 from edge.mavlink.settings import GuidanceLimits
 from edge.uav.base import Estimate, TrackState
@@ -131,6 +131,60 @@ def test_the_gimbal_is_claimed_for_the_camera_s_own_system_id() -> None:
     claim, pointing = GuidanceUnderTest(system=7, gimbal=True).tick(0.0)
     assert (claim.target_system, claim.param1, claim.param2) == (1, 7, 100)
     assert (pointing.target_system, pointing.get_srcSystem()) == (1, 7)
+
+
+def gimbal_status(system: int, component: int, device: int = 1, flags: int = 0) -> Any:
+    return mavlink.MAVLink_gimbal_manager_status_message(0, flags, device, system, component, 0, 0)
+
+
+def claims(messages: list[Any]) -> int:
+    return sum(m.get_type() == "COMMAND_LONG" for m in messages)
+
+
+@pytest.mark.parametrize("by_hand", [gimbal_status(255, 190), gimbal_status(1, 1), gimbal_status(7, 100, flags=256)])
+def test_a_gimbal_that_an_operator_has_taken_is_left_to_them_until_it_is_free_or_a_target_is_selected(
+    by_hand: Any,
+) -> None:
+    under_test = GuidanceUnderTest(system=7, gimbal=True)
+    assert claims(under_test.tick(0.0)) == 1
+    under_test.guidance.handle_gimbal_status(gimbal_status(255, 190), 0.1)  # sent before the claim was heard
+    under_test.guidance.handle_gimbal_status(gimbal_status(7, 100), 0.6)
+    assert kinds(under_test.tick(6.0)) == {"GIMBAL_MANAGER_SET_PITCHYAW"}  # what it has, it need not claim
+    under_test.guidance.handle_gimbal_status(by_hand, 6.1)
+    assert under_test.tick(12.0) == []
+    assert under_test.guidance.hold_reason.endswith("controls the gimbal")
+    under_test.guidance.handle_gimbal_status(gimbal_status(0, 0), 13.0)
+    assert claims(under_test.tick(13.1)) == 1
+    under_test.guidance.handle_gimbal_status(by_hand, 16.0)  # the claim was refused
+    assert under_test.tick(17.0) == []
+    under_test.guidance.begin(VEHICLE)
+    assert claims(under_test.tick(18.0)) == 1
+
+
+def test_a_vehicle_follows_on_while_the_gimbal_is_left_to_an_operator() -> None:
+    under_test = GuidanceUnderTest(gimbal=True, follow=True)
+    under_test.tick(0.0)
+    under_test.guidance.handle_gimbal_status(gimbal_status(255, 190), 3.0)
+    assert kinds(under_test.tick(4.0)) == {"FOLLOW_TARGET"}
+
+
+def test_stations_are_told_to_whom_the_gimbal_is_left() -> None:
+    under_test, said = GuidanceUnderTest(gimbal=True), list[str]()
+    control = GuidanceControl(under_test.guidance, *[SimpleNamespace(say=said.append)] * 3)  # type: ignore[arg-type]
+    under_test.tick(0.0)
+    for system, component in ((1, 100), (255, 1), (255, 1), (0, 0)):
+        status = gimbal_status(system, component)
+        control.handle(ReceivedMessage(status, status.get_type(), 1, 154, 0), 1.0)  # not the autopilot's manager
+        control.handle(ReceivedMessage(status, status.get_type(), 1, 1, 0), 1.0)
+    assert said == ["Syncline: gimbal left to system 255", "Syncline: gimbal is free again"]
+
+
+def test_a_second_gimbal_that_nobody_controls_is_not_claimed_again_and_again() -> None:
+    under_test = GuidanceUnderTest(gimbal=True)
+    under_test.tick(0.0)
+    for k in range(1, 20):
+        under_test.guidance.handle_gimbal_status(gimbal_status(1, 100) if k % 2 else gimbal_status(0, 0, 2), 0.5 * k)
+        assert claims(under_test.tick(0.5 * k)) == 0
 
 
 def test_a_stale_estimate_is_extrapolated_for_at_most_a_second() -> None:

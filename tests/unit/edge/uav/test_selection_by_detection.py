@@ -34,14 +34,14 @@ def agent_with(detector: Detector | None, said: list[str] | None = None) -> UavA
     return UavAgent(anything, anything, vehicle, lambda execute: anything, anything, "uav", settings, detector=detector)
 
 
-def selected(detector: Detector | None, u: float, v: float) -> list[float]:
+def selected(detector: Detector | None, u: float, v: float, radius: float = 0.0) -> list[float]:
     """The box [px] that is tracked after the point (u, v) of a 640x480 image was selected."""
     agent = agent_with(detector)
     boxes: list[list[float]] = []
     agent._publish = lambda message: boxes.append(list(getattr(message, "box", ())))
     image = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     agent._take_frame(Frame(image, 0, 10**9), 10**9)
-    assert agent._execute(SelectTarget(u / 640, v / 480, u / 640, v / 480, 255))
+    assert agent._execute(SelectTarget(u / 640, v / 480, u / 640, v / 480, 255, radius))
     return next(box for box in boxes if len(box) == 4)
 
 
@@ -54,6 +54,11 @@ def test_where_nothing_is_detected_the_box_is_around_the_point() -> None:
     for detector in (Boxes(), None):
         x, y, width, height = selected(detector, 300.0, 50.0)
         assert (x + 0.5 * width, y + 0.5 * height) == pytest.approx((299.5, 49.5))
+
+
+def test_a_point_with_a_radius_selects_what_is_within_it() -> None:
+    assert selected(None, 300.0, 150.0, radius=0.1) == pytest.approx([235.5, 85.5, 128.0, 128.0])  # of 640 px
+    assert selected(Boxes(), 130.0, 120.0, radius=0.1)[2:] == pytest.approx([30.0, 20.0])  # what is there is known
 
 
 def test_a_selection_on_a_black_image_is_refused_and_stations_get_a_text() -> None:
