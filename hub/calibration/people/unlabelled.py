@@ -370,9 +370,14 @@ def _touching(
 
 def _time_maps(prepared: PreparedSession, initial: Mapping[str, CameraCalibration]) -> dict[str, TimeMapEstimate]:
     """The registered lags as maps between times from the session's origins."""
-    names = [name for name in prepared.cameras if name in initial]
-    base = initial[names[0]].time_map.time_offset + prepared.time_origins[names[0]] if names else 0.0
-    return {
-        name: TimeMapEstimate(1.0, initial[name].time_map.time_offset + prepared.time_origins[name] - base, 0.0)
-        for name in names
-    }
+    out: dict[str, TimeMapEstimate] = {}
+    base = 0.0
+    for name, camera in prepared.cameras.items():
+        if name not in initial:
+            continue
+        lag = initial[name].time_map.time_offset + prepared.time_origins[name]
+        base = base if out else lag
+        ends = [time for track in camera.tracks.values() for time in (track.time[0], track.time[-1])]
+        middle = 0.5 * (min(ends) + max(ends))  # about which offset and rate are uncorrelated
+        out[name] = TimeMapEstimate(1.0, middle + lag - base, middle)
+    return out
