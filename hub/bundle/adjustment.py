@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from hub.bundle.bordered_system import solve
-from hub.bundle.noise.noise_scale import estimate_noise, residual_std
+from hub.bundle.noise.noise_scale import residual_std, with_noise
 from hub.bundle.normal_equations import assemble, weigh_residuals
 from hub.bundle.problem import (
     CAMERA_PARAMETERS,
@@ -74,8 +74,10 @@ def adjust(
         last = round_index == rounds - 1
         max_iterations = iterations if last else max(4, iterations // 3)
         state = minimise(problem, state, prior, robust, max_iterations, _COARSE_TOLERANCE, steps, coarse)
-        noise = residual_std(problem, state) if coarse else estimate_noise(problem, state, prior)
-        state = replace(state, sigma=noise)
+        if coarse:
+            state = replace(state, sigma=residual_std(problem, state))
+        else:
+            state = with_noise(problem, state, prior)
         prior = estimate_smoothness(problem, state)
         if round_index >= rounds - 2:
             problem = mark_inliers(problem, state)
@@ -86,7 +88,7 @@ def adjust(
         most = iterations if rounds <= 2 else _MORE_ITERATIONS * iterations
         state = minimise(problem, state, prior, robust, most, _FINE_TOLERANCE, steps, coarse)
         problem = without_collapsed(problem, state)
-        state = replace(state, sigma=estimate_noise(problem, state, prior))
+        state = with_noise(problem, state, prior)
     return problem, replace(state, steps=tuple(steps)), prior
 
 

@@ -159,10 +159,14 @@ class UsedRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """The 3-D path of one label on the internal reference time: a spline, or separate points. control: (size, 3)."""
+    """The 3-D path of one label on the internal reference time: a spline, or separate points. control: (size, 3).
+
+    determined: the share of its third differences that observations rather than the smoothness prior determine.
+    """
 
     basis: SplineBasis | PointBasis
     control: Floats
+    determined: float = 1.0
 
     def at(self, time: Floats, derivative: int = 0) -> Floats:
         """Positions (n, 3) or a derivative; NaN outside the observed intervals."""

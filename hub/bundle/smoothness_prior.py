@@ -1,6 +1,9 @@
 """Smoothness prior of trajectories: squared third differences of the spline's control points.
 
-Where a path is hardly observed its third differences are expected to be as large as where it is well observed.
+Where a path is hardly observed its third differences are expected to be as large as where it is well observed. Their
+variance is estimated by the evidence (MacKay 1992): squares over the number of differences that observations determine.
+Over all of them it would decrease from round to round, since the prior shrinks those that it determines: of people whose
+heads are seen within 1.5 px by 10 frames a second it went to 0, and clocks by it.
 """
 
 from __future__ import annotations
@@ -9,13 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.bundle.bordered_system import third_difference_band, third_difference_gradient, third_differences
+from hub.bundle.bordered_system import (
+    BAND,
+    THIRD_DIFFERENCE,
+    third_difference_band,
+    third_difference_gradient,
+    third_differences,
+)
 from hub.bundle.problem import AdjustmentState, Problem, Trajectory
 from hub.trajectory.splines import SUPPORT
 from protocols.geometry.types import Bools, Floats, Ints
 
 _MIN_SCATTER_SHARE = 1e-3 / 3.0
 """Smallest share of a path's scatter in any direction: a planar path has none across its plane."""
+_MIN_DETERMINED = 1e-3  # a bound: of a path of which observations say nothing the share is 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,12 +48,13 @@ class SmoothnessPrior:
 class PathScatter:
     """Extent of a path in all directions, by which the strength of its prior is normalised.
 
-    seen: (m,) knot intervals that two cameras see. control_mask: (size,) control points of those that are `_held`.
+    seen: (m,) knot intervals that two cameras see; held: those whose neighbours they see too. control_mask: (size,) control points of those that are `_held`.
     floor: added to the diagonal of their scatter matrix S. scale: of the metric ``scale * S⁻¹``, in which the prior has
     the strength that was estimated.
     """
 
     seen: Bools
+    held: Bools
     control_mask: Bools
     floor: float
     scale: float
@@ -68,12 +79,36 @@ def estimate_smoothness(problem: Problem, state: AdjustmentState, weak: bool = F
         seen_by_two = seen.sum(axis=0)[starts] >= 2
         held = _held(seen_by_two, starts)
         chosen = differences[held] if held.sum() >= 4 else differences
-        variance = float(np.mean(chosen**2)) if len(chosen) else 1.0
+        variance = float(np.mean(chosen**2)) / path.determined if len(chosen) else 1.0
         scale = float(np.median(np.ptp(path.control, axis=0))) or 1.0
         variance = max(variance, (1e-6 * scale) ** 2)
         weights.append(np.full(count, (1e-3 if weak else 1.0) / variance))
         scatters.append(None if weak else _path_scatter(path, seen_by_two, held))
     return SmoothnessPrior(tuple(weights), tuple(scatters))
+
+
+def determined_shares(state: AdjustmentState, prior: SmoothnessPrior, blocks: Floats) -> tuple[float, ...]:
+    """By label, the share of a path's third differences that its observations determine (MacKay's gamma).
+
+    blocks: of the covariance of all control points under the prior, as of `inverse_blocks`.
+    """
+    shares, first = list[float](), 0
+    for label, path in enumerate(state.trajectories):
+        weight, scatter = prior.of(label)
+        starts = path.basis.interval_starts()
+        block, inside = np.divmod(3 * (first + starts), BAND)
+        entries = inside[:, None] + np.arange(BAND)
+        covariance = blocks[block[:, None, None], entries[:, :, None], entries[:, None, :]]
+        covariance = covariance.reshape(-1, SUPPORT, 3, SUPPORT, 3)
+        spread = np.einsum("a,naibj,b->nij", THIRD_DIFFERENCE, covariance, THIRD_DIFFERENCE)
+        metric, held = np.eye(3), np.ones(len(starts), dtype=np.bool_)
+        if scatter is not None:
+            held = scatter.held
+            metric = scatter.scale * np.linalg.inv(_scatter(path.control[scatter.control_mask], scatter.floor))
+        left = weight * np.einsum("ij,nji->n", metric, spread) / 3.0  # 1 where the prior alone says anything
+        shares.append(float(np.clip(1.0 - left[held].mean(), _MIN_DETERMINED, 1.0)) if held.any() else 1.0)
+        first += path.basis.size
+    return tuple(shares)
 
 
 def _held(seen: Bools, starts: Ints) -> Bools:
@@ -107,7 +142,7 @@ def _path_scatter(path: Trajectory, seen: Bools, held: Bools) -> PathScatter | N
     differences = third_differences(path.basis, path.control)[held]
     inverse = np.linalg.inv(_scatter(path.control[control_mask], floor))
     plain, metric = float((differences**2).sum()), float(((differences @ inverse) * differences).sum())
-    return PathScatter(seen, control_mask, floor, plain / metric) if metric > 0.0 else None
+    return PathScatter(seen, held, control_mask, floor, plain / metric) if metric > 0.0 else None
 
 
 def _centred(control: Floats) -> Floats:

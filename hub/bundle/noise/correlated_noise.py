@@ -15,7 +15,7 @@ import numpy as np
 from hub.bundle.covariance import CameraCovariance, relative_rotation_stds
 from hub.bundle.gls import GlsSolution, is_tractable, solve_gls
 from hub.bundle.noise.gauss_markov import estimate_correlated_noise
-from hub.bundle.noise.noise_scale import correlation_inflation, estimate_noise
+from hub.bundle.noise.noise_scale import correlation_inflation, with_noise
 from hub.bundle.normal_equations import camera_priors
 from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, Column, LensPrior, Problem
 from hub.bundle.smoothness_prior import estimate_smoothness
@@ -85,7 +85,7 @@ def refit_with_correlated_noise(
     if not (np.isfinite(best.cost) and rotation_std <= _MAX_ROTATION_STD):
         return problem, state
     prior = estimate_smoothness(found, best.state)
-    refitted = replace(best.state, sigma=estimate_noise(found, best.state, prior), correlated_noise=noise_model)
+    refitted = replace(with_noise(found, best.state, prior), correlated_noise=noise_model)
     step = AdjustmentStep("correlated noise", float(np.sqrt(np.mean(refitted.sigma**2))))
     return found, replace(refitted, steps=(*refitted.steps, step))
 

@@ -36,7 +36,7 @@ from hub.bundle.residuals import (
     predict,
     residual_norms,
 )
-from hub.bundle.smoothness_prior import SmoothnessPrior
+from hub.bundle.smoothness_prior import SmoothnessPrior, determined_shares
 from hub.trajectory.discrete import PointBasis
 from protocols.geometry.types import Floats
 
@@ -57,28 +57,29 @@ _SIGNIFICANCE_SIGMA = 3.0
 """Sigma by which a correlation must exceed 0 to count."""
 
 
-def estimate_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> Floats:
-    """Robust noise (cameras,) of one pixel coordinate: residuals over their redundancy (Förstner 1979).
+def with_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> AdjustmentState:
+    """The state with ``sigma`` (cameras,), the robust noise of one pixel coordinate: residuals over their redundancy
+    (Förstner 1979), and with the shares of the paths that are ``determined``. prior: of the fit.
 
     A path that follows the camera with the smallest residuals makes them smaller still: taken for its noise, they would
     end at 0. Of camera parameters, each counts for one coordinate.
     """
     noise = residual_std(problem, state)
     if any(isinstance(path.basis, PointBasis) for path in state.trajectories):
-        return noise
+        return replace(state, sigma=noise)
     fixed = replace(
         problem, free_parameters=FreeParameters(pose=False, clock=False), lens_priors=(), lens_tolerances=()
     )
     system, _ = build_system(fixed, state, prior, robust=False)
+    blocks = inverse_blocks(system.band)
     found = Covariance(
-        np.zeros(0, dtype=np.int64),
-        len(state.cameras),
-        DenseCovariance(np.zeros((0, 0))),
-        system.border,
-        inverse_blocks(system.band),
+        np.zeros(0, dtype=np.int64), len(state.cameras), DenseCovariance(np.zeros((0, 0))), system.border, blocks
     )
     parameters = np.bincount(problem.free_columns // CAMERA_PARAMETERS, minlength=len(noise)).astype(np.float64)
-    return _over_redundancy(noise, fixed, state, found, parameters, _MAX_ROWS_IN_ROUNDS)
+    noise = _over_redundancy(noise, fixed, state, found, parameters, _MAX_ROWS_IN_ROUNDS)
+    shares = determined_shares(state, prior, blocks)
+    paths = tuple(replace(path, determined=one) for path, one in zip(state.trajectories, shares, strict=True))
+    return replace(state, sigma=noise, trajectories=paths)
 
 
 def rescale_noise(problem: Problem, state: AdjustmentState, prior: SmoothnessPrior) -> AdjustmentState:
