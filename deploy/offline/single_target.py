@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 from edge.offline.detections import HEADER
-from hub.calibration.people import END_STD
+from hub.tracking.calibration.people import END_STD
 
 MAX_FALSE_SHARE = 0.1
 """Of false rows beside the target's. As many as that may be among the target's own, in frames in which it is missed,

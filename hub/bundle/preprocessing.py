@@ -169,7 +169,8 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
             smooth,
             LensPrior(lens.focal, focal_std) if focal_std else None,
             readout_given=rig_camera.readout is not None,
-            stated_std=_typical_std(tracks),
+            # Those of a person's ends are ours, of any detector: only their ratio is meant.
+            stated_std=0.0 if rig.metadata.get("target") == "person" else _typical_std(tracks),
         )
 
     for name, rig_camera in rig.cameras.items():

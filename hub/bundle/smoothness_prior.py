@@ -1,9 +1,9 @@
 """Smoothness prior of trajectories: squared third differences of the spline's control points.
 
 Where a path is hardly observed its third differences are expected to be as large as where it is well observed. Their
-variance is estimated by the evidence (MacKay 1992): squares over the number of differences that observations determine.
-Over all of them it would decrease from round to round, since the prior shrinks those that it determines: of people whose
-heads are seen within 1.5 px by 10 frames a second it went to 0, and clocks by it.
+variance is estimated by the evidence (MacKay 1992): their squares over the number that observations determine. Over the
+number of all it decreases from round to round, since the prior shrinks those that it determines itself: of heads seen
+within 1.5 px at 10 frames a second it went to 0, and clocks followed by 300 ppm.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ class SmoothnessPrior:
 class PathScatter:
     """Extent of a path in all directions, by which the strength of its prior is normalised.
 
-    seen: (m,) knot intervals that two cameras see; held: those whose neighbours they see too. control_mask: (size,) control points of those that are `_held`.
+    seen: (m,) knot intervals that two cameras see. held: (m,) those that are `_held`. control_mask: (size,) their
+    control points.
     floor: added to the diagonal of their scatter matrix S. scale: of the metric ``scale * S⁻¹``, in which the prior has
     the strength that was estimated.
     """
@@ -101,10 +102,13 @@ def determined_shares(state: AdjustmentState, prior: SmoothnessPrior, blocks: Fl
         covariance = blocks[block[:, None, None], entries[:, :, None], entries[:, None, :]]
         covariance = covariance.reshape(-1, SUPPORT, 3, SUPPORT, 3)
         spread = np.einsum("a,naibj,b->nij", THIRD_DIFFERENCE, covariance, THIRD_DIFFERENCE)
-        metric, held = np.eye(3), np.ones(len(starts), dtype=np.bool_)
-        if scatter is not None:
+        if scatter is None:
+            metric = np.asarray(np.eye(3))
+            held = np.ones(len(starts), dtype=np.bool_)
+        else:
+            inverse = np.linalg.inv(_scatter(path.control[scatter.control_mask], scatter.floor))
+            metric = np.asarray(scatter.scale * inverse)
             held = scatter.held
-            metric = scatter.scale * np.linalg.inv(_scatter(path.control[scatter.control_mask], scatter.floor))
         left = weight * np.einsum("ij,nji->n", metric, spread) / 3.0  # 1 where the prior alone says anything
         shares.append(float(np.clip(1.0 - left[held].mean(), _MIN_DETERMINED, 1.0)) if held.any() else 1.0)
         first += path.basis.size

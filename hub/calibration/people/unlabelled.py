@@ -18,14 +18,14 @@ from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import CameraState, FreeParameters
 from hub.calibration.final_adjustment import final_adjustment
 from hub.calibration.pairs.pair_network import Progress
-from hub.calibration.people import END_STD, MIN_INTERVAL_NS
+from hub.calibration.people import MIN_INTERVAL_NS
 from hub.calibration.people.ground_plane import Bodies, GroundPlane, estimate_ground_plane
 from hub.calibration.people.registration import GroundPoints, Registration, lag_grid, register, rotation
 from hub.calibration.result import assemble_calibration
 from hub.calibration.solvers import solve_network
 from hub.clocks.clock_graph import ClockGraph, TimeMapEstimate
 from hub.clocks.external_prior import ExternalClockPrior
-from hub.tracking.calibration.people import TOUCHING_DISTANCE
+from hub.tracking.calibration.people import END_STD, TOUCHING_DISTANCE
 from hub.tracking.offline import FollowedTrack, follow
 from protocols.core.clocks import NANOSECONDS, CameraTime, TimeMap
 from protocols.core.errors import Refused
@@ -96,9 +96,7 @@ def calibrate_people(
     bars = [bar for bar in rig.scale_bars if bar[:2] == ("head", "foot")]
     rig = replace(rig, metadata=rig.metadata | {"target": "person"})
     prepared = prepare(rig, observations)
-    # The stds are ours, of any detector: only their ratios are meant.
-    cameras = {name: replace(camera, stated_std=0.0) for name, camera in prepared.cameras.items()}
-    prepared = replace(prepared, cameras=cameras, refused=prepared.refused | refused)
+    prepared = replace(prepared, refused=prepared.refused | refused)
     poses = {name: camera.pose for name, camera in initial.items()}
     clocks = _time_maps(prepared, initial)
 
