@@ -213,17 +213,25 @@ def calibrate(
         return _from_people(session, options, progress)
     found: list[CalibrationResult] = []
     refusals: list[Refused] = []
+    spent, seeing = 0.0, {message.camera for message in session.people}
     # By colour first, which is ten times as fast and no less exact where it finds all cameras.
     for way in (_from_labels, _from_people) if _suits_people(options) else (_from_labels,):
+        began = time.process_time()
         try:
             found.append(way(session, options, progress))
         except Refused as refused:
             refusals.append(refused)
-        if found and not found[-1].refused:
+        spent += time.process_time() - began
+        if found and not seeing & found[-1].refused.keys():
             break
     if not found:
-        raise refusals[0]
-    return max(found, key=lambda one: len(one.cameras))
+        by_colour, *by_place = refusals
+        by_colour.cpu_seconds = spent
+        if by_place:
+            by_colour.reason = f"by colour: {by_colour.reason}; by where people stand: {by_place[0].reason}"
+        raise by_colour
+    best = max(found, key=lambda one: len(one.cameras))
+    return replace(best, calibration=replace(best.calibration, cpu_seconds=spent))
 
 
 def _suits_people(options: CalibrationOptions) -> bool:
@@ -245,17 +253,21 @@ def _from_labels(session: Session, options: CalibrationOptions, progress: Progre
     read, session = session, _with_associated_people(session, progress, known)
 
     def estimated(session: Session, known: FixedCalibration | None) -> Calibration:
-        return estimate_calibration(
-            session.rig,
-            session.observations,
-            progress,
-            solver=options.solver,
-            known=known,
-            thorough=options.thorough,
-            seed=options.seed,
-            refine_lenses=options.refine_lenses,
-            clock_priors=session.clock_priors if isinstance(session, RecordedSession) else None,
-        )
+        try:
+            return estimate_calibration(
+                session.rig,
+                session.observations,
+                progress,
+                solver=options.solver,
+                known=known,
+                thorough=options.thorough,
+                seed=options.seed,
+                refine_lenses=options.refine_lenses,
+                clock_priors=session.clock_priors if isinstance(session, RecordedSession) else None,
+            )
+        except np.linalg.LinAlgError as error:
+            reason = f"the observations do not determine the poses ({error}): film longer, or move further"
+            raise Refused(reason, dict.fromkeys(session.rig.cameras, reason)) from error
 
     try:
         found = estimated(session, known)
@@ -393,7 +405,10 @@ def triangulate(
 def _read_rows(session: Path, observations: Path | None, rig: Rig) -> tuple[Observations, tuple[str, ...]]:
     """The observations that a path holds, and warnings. The calibration knows the cameras: no rig.toml is needed."""
     if is_log(session):
-        read = load_session(session, observations)
+        read = read_session(session, observations)
+        if isinstance(read, RecordedSession) and read.people:
+            what = "several unlabelled people, who have no points to triangulate"
+            raise InputError(what, file=session, remedy="follow them: `syncline follow`")
         return read.observations, read.warnings
     if not session.exists():
         raise InputError("this session does not exist", file=session, remedy="give a session folder or a .mcap log")

@@ -69,7 +69,8 @@ def load_report_input(source: Path, session: Path | None, progress: Progress) ->
     read = read_session(source)
     outcome: Calibration | Refused
     try:
-        outcome = calibrate(read, progress=progress).calibration
+        result = calibrate(read, progress=progress)
+        outcome, read = result.calibration, result.session
     except Refused as refused:
         outcome = refused
     return ReportInput(outcome, read.rig, read.observations, "", history=offset_std_history(source))
@@ -105,6 +106,9 @@ def _input_from_folder(folder: Path, session: Path | None) -> ReportInput:
     cameras = {name: _with_lag(camera, _table(document.get("cameras"))) for name, camera in cameras.items()}
     file = folder / TRAJECTORY
     tables = read_trajectory(file) if file.exists() else ()
+    if len(observations) and tables and not {table.label for table in tables} & set(observations.labels):
+        missing = "its points are of people who were followed: figures of the observations are left out"
+        observations = Observations({}, (missing,))
     calibration = Calibration(
         cameras=cameras,
         reference=str(metadata.get("reference") or next(iter(cameras))),

@@ -8,11 +8,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 from edge.offline.detections import HEADER
-from hub.tracking.calibration.people import END_STD
+from hub.tracking.calibration.people import END_STD, SEVERAL_SHARE
 
-MAX_FALSE_SHARE = 0.1
-"""Of false rows beside the target's. As many as that may be among the target's own, in frames in which it is missed,
-and with 10 % outliers pair synchronisation found the lag in every run (``python -m tests.bench.pair_timing``)."""
 _CONFIRMED_ROWS = 3
 """As of a tracklet: below, a label in a gap of the target is a flicker, not the target seen again."""
 
@@ -42,7 +39,7 @@ def rows_of_one_target(rows: Sequence[str]) -> tuple[tuple[str, ...], int, int]:
             kept = sorted([*kept, *one.values()])
         else:
             beside.append(len(one))
-    if sum(beside) > MAX_FALSE_SHARE * len(kept):
+    if sum(beside) > SEVERAL_SHARE * len(kept):
         return (), 0, 1 + max(sum(count >= _CONFIRMED_ROWS for count in beside), 1)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

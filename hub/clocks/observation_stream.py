@@ -6,6 +6,8 @@ external clock priors and arrivals.
 
 from __future__ import annotations
 
+import itertools
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -14,7 +16,7 @@ from google.protobuf.message import Message
 from hub.clocks.change_detector import ClockChange
 from hub.clocks.external_prior import ArrivalPriors, ExternalClockPrior, ExternalClockPriors
 from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments, RateChanges
-from hub.tracking.calibration.people import PERSON, PeopleTracklets
+from hub.tracking.calibration.people import PERSON, SEVERAL_SHARE, PeopleTracklets
 from hub.tracking.detections import tracked_kind
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
@@ -26,8 +28,6 @@ from protocols.session.rig import Rig
 
 LEAST_ROWS = 90
 """Detections of a marker that two cameras need to be calibrated by them: three seconds at 30 Hz."""
-SEVERAL_SHARE = 0.02
-"""Of a camera's frames, in which there are several people: false detections beside one person are fewer."""
 _PEOPLE_WINDOW_S = 600.0
 """Of a recorded log: labels by colour of more tracklets take a minute and more."""
 
@@ -166,7 +166,7 @@ def session_from_messages(messages: Iterable[Message]) -> RecordedStream:
     Times of arrival are not used: a log of other makers holds whatever they wrote. Raises Refused where there is
     nothing to calibrate from, and InputError for rows that are no pixels of their images.
     """
-    stream, people = ObservationStream(), list[pb.Observation]()
+    stream, held = ObservationStream(), dict[tuple[str, str], deque[pb.Observation]]()
     for message in messages:
         if isinstance(message, pb.AgentStatus):
             stream.clock_priors.handle(message)
@@ -174,19 +174,27 @@ def session_from_messages(messages: Iterable[Message]) -> RecordedStream:
         if isinstance(message, pb.Observation):
             message, _ = stream.assign(message, None)
             if any(one.kind == PERSON for one in message.detections):
-                people.append(message)
+                mine = held.setdefault((message.camera, message.boot_id), deque())
+                mine.append(message)
+                while mine[0].device_time_ns < message.device_time_ns - _PEOPLE_WINDOW_S * NANOSECONDS:
+                    mine.popleft()
         stream.store(message)
     of_marker = stream.has_marker(LEAST_ROWS)
-    people = [] if of_marker else [one for one in people if one.boot_id == stream.people.boot(one.camera)]
-    people = people if are_several(people) else []
+    longest = dict(sorted(held, key=lambda key: len(held[key])))  # by camera, the boot id with most frames
+    people = () if of_marker else tuple(itertools.chain(*(held[key] for key in longest.items())))
+    people = people if are_several(people) else ()
     rig, observations = stream.build(of_marker, refusing=not people)
     source = stream.marker if of_marker else stream.people
-    priors = stream.clock_priors.for_boots({name: source.boot(name) for name in rig.cameras})
+    boots = {name: source.boot(name) for name in rig.cameras}
+    if people:  # those told by colour are of the last boot ids: a prior has to be of both
+        boots = {name: boot for name, boot in boots.items() if longest.get(name) == boot}
     alarms = tuple(
-        f"{text}: its rows on one side of that were left out" for text in stream.clocks.alarms.values() if of_marker
+        f"{text}: its rows on one side of that were left out"
+        for text in stream.clocks.alarms.values()
+        if of_marker or people
     )
     warnings = alarms + stream.marker.warnings + column_warnings(rig, observations)
-    return RecordedStream(rig, observations, priors, tuple(people), warnings)
+    return RecordedStream(rig, observations, stream.clock_priors.for_boots(boots), people, warnings)
 
 
 def are_several(messages: Collection[pb.Observation]) -> bool:

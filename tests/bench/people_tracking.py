@@ -23,7 +23,7 @@ from edge.agents.camera import PredictionSubscriber
 from edge.scenes import renderer_for
 from edge.scenes.common.base import look_at_pose
 from edge.scenes.people.scene import PeopleScene
-from hub.calibration.pipeline import calibrate
+from hub.api import RecordedSession, calibrate
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.messages import prediction_message
@@ -217,11 +217,11 @@ def _triangulated(
 
 
 def self_calibrated(seed: int, people: int, seconds: float = 60.0, faults: Faults | None = None) -> dict[str, Any]:
-    """Calibration from walking people with known intrinsics only."""
+    """Calibration from walking people with known intrinsics only, as of a log."""
     scene = scenes.get_people_scene(seed, 5, people)
     traffic = film(scene, seconds, seed, faults or Faults(false=0.02))
-    tracklets = PeopleTracklets(seconds)
-    for message in traffic.messages():
+    tracklets, messages = PeopleTracklets(seconds), tuple(traffic.messages())
+    for message in messages:
         tracklets.handle(message)
     rig = Rig(
         {
@@ -232,7 +232,9 @@ def self_calibrated(seed: int, people: int, seconds: float = 60.0, faults: Fault
     )
     begun = time.process_time()
     try:
-        found = calibrate(rig, tracklets.observations())
+        found = calibrate(
+            RecordedSession(rig, tracklets.observations(), (), "walk", people=messages if people > 1 else ())
+        ).calibration
     except Refused as refused:
         return {"seed": seed, "people": people, "cameras": 0, "refused": refused.reason}
     return {"seed": seed, "people": people, "cpu_s": time.process_time() - begun, **_errors(scene, found, seconds)}

@@ -47,6 +47,7 @@ _STD_PX, _CUT_ACROSS, _CUT_ALONG = 1.5, 0.1, 0.5
 a body of whom half the width may be out of the picture, and along one of whom a third to all is in it."""
 _MAX_INTERVAL_S = 10.0
 """Between frames. Nobody is followed over so long; 60 frames a second in milliseconds seem 16.7 s apart."""
+_MAX_SET_BACK = 0.1  # of the frames at which a clock is set back; of numbers in another order than time it is half
 _MAX_EMPTY_PER_FRAME = 20
 """Frames without a row that are added for one with rows. Rarer numbers are labels, not a numbering of the frames."""
 
@@ -279,7 +280,7 @@ def without_clock_steps(messages: list[pb.Observation], file: Path) -> tuple[lis
         mine = sorted((m for m in messages if m.camera == camera), key=lambda one: (one.frame, one.device_time_ns))
         times = np.array([message.device_time_ns for message in mine]) / NANOSECONDS
         back = np.flatnonzero(np.diff(times) < 0.0)
-        if len(back) != 1 or times[back[0] + 1] < times[0]:  # no clock set back once, but numbers in another order
+        if len(back) > _MAX_SET_BACK * len(times):  # no clock that was set, but numbers in another order
             back, mine, times = back[:0], sorted(mine, key=lambda one: one.device_time_ns), np.sort(times)
         gaps = np.diff(times)
         intervals += [float(np.median(gaps))] if len(gaps) else []
@@ -288,7 +289,7 @@ def without_clock_steps(messages: list[pb.Observation], file: Path) -> tuple[lis
         kept |= {id(mine[i]) for i in part.tolist()}
         if len(part) < len(mine):
             left = f"{len(mine) - len(part)} of {len(mine)} frames on the other side are left out"
-            warnings.append(f"{camera}: its clock steps by {max(gaps[steps], key=abs):.0f} s; {left}")
+            warnings.append(f"{camera}: its clock steps by {max(gaps[steps], key=abs):+.1f} s; {left}")
     if min(intervals, default=0.0) > _MAX_INTERVAL_S:
         what = f"frames are {min(intervals):.4g} s apart, over which nobody is followed"
         raise InputError(what, file=file, remedy="give times in seconds, not in milliseconds or another unit")

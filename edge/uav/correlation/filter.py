@@ -108,7 +108,7 @@ class CorrelationFilter:
     def respond(self, image: Image, box: OrientedBox, std: float = np.inf) -> Response:
         """The answer in a window about a box, for a target of its size and angle; std: of its centre [image px].
 
-        The peak is that of the answer times the density of Student's t: one of its kind beside it may answer more.
+        The peak is that of the answer times a Cauchy weight: one of its kind beside it may answer more.
         """
         assert self._filter is not None
         assert self._past is not None

@@ -142,8 +142,8 @@ def _contradictions(reconstruction: Reconstruction) -> tuple[str, ...]:
     worst = refuted[0]
     name, change, std = reconstruction.names[worst.camera], worst.change[0], np.sqrt(worst.covariance[0, 0])
     return (
-        f"{name}: its people contradict the others' as if its focal length were {100 * change:+.1f} % ± "
-        f"{100 * std:.1f} % off: a camera's lens is wrong, or its boxes are longer or shorter than the others', or it "
+        f"{name}: its people would fit the others' with a focal length {100 * change:+.1f} % ± {100 * std:.1f} % "
+        "longer: its lens or another camera's is wrong, or its boxes are longer or shorter than the others', or it "
         "looks steeply down; positions may be off by more than their stds",
     )
 

@@ -11,14 +11,15 @@ from google.protobuf.message import Message
 
 from deploy.cli import run
 from edge import scenes
-from hub.api import calibrate, read_session
+from hub.api import RecordedSession, calibrate, read_session, triangulate
 from protocols.core.clocks import CameraTime
-from protocols.core.errors import Refused
+from protocols.core.errors import InputError, Refused
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CAMERA_INFO, OBSERVATION, STATUS
 from tests.integration.live.test_external_clock_prior import clock_status, regular_session
 from tests.integration.live.test_live_hub import messages
+from tests.support import crowds
 from tests.support.people_traffic import film
 from tests.support.rigs import simulate
 
@@ -76,6 +77,27 @@ def test_people_in_a_log_become_labelled_walkers(tmp_path: Path) -> None:
     session = read_session(recorded(tmp_path / "people.mcap", content))
     assert {label.partition("-")[2] for _, label in session.observations.tracks} == {"head", "foot"}
     assert np.all([label.startswith("walker") for _, label in session.observations.tracks])
+
+
+def test_several_people_in_a_log_have_no_points_to_triangulate(tmp_path: Path) -> None:
+    traffic = film(scenes.get_people_scene(21, 3, 2), 8.0, 21)
+    log = recorded(tmp_path / "people.mcap", [*traffic.infos, *(message for _, message in traffic.arrivals)])
+    known = crowds.write_calibration(tmp_path / "calibration.toml")
+    with pytest.raises(InputError, match="several unlabelled people"):
+        triangulate(log, known)
+
+
+def test_of_people_before_and_after_a_clock_was_set_the_longer_side_counts(tmp_path: Path) -> None:
+    traffic = film(scenes.get_people_scene(21, 3, 2), 20.0, 21)
+    content: list[Message] = [*traffic.infos]
+    for _, message in traffic.arrivals:
+        if message.camera == "cam1" and message.sequence >= 150:
+            message.device_time_ns -= 60 * 10**9
+        content.append(message)
+    session = read_session(recorded(tmp_path / "set.mcap", content))
+    assert isinstance(session, RecordedSession)
+    assert sum(message.camera == "cam1" for message in session.people) > 140
+    assert any("clock of cam1 stepped" in warning for warning in session.warnings)
 
 
 def test_people_in_a_log_who_wear_one_colour_are_told_by_where_they_are(tmp_path: Path) -> None:

@@ -205,7 +205,7 @@ def test_a_time_that_is_a_clock_step_away_is_left_out_by_name(tmp_path: Path) ->
     source = read(tmp_path, BOXES + "".join(lines) + "left,5,1e9,100,200,40,160\n")
     assert [message.camera for message in source.observations].count("left") == 5
     warning, _ = source.warnings
-    assert warning == "left: its clock steps by 1000000000 s; 1 of 6 frames on the other side are left out"
+    assert warning == "left: its clock steps by +999999999.6 s; 1 of 6 frames on the other side are left out"
 
 
 def test_a_row_that_is_there_twice_is_one_person(tmp_path: Path) -> None:

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from hub.bundle.adjustment import adjust
+from hub.bundle.bordered_system import BAND, THIRD_DIFFERENCE
 from hub.bundle.covariance import equivalent_std
-from hub.bundle.problem import AdjustmentState, CameraState, Problem, Trajectory
+from hub.bundle.noise.noise_scale import with_noise
+from hub.bundle.normal_equations import build_system
+from hub.bundle.problem import AdjustmentState, CameraState, FreeParameters, Problem, Trajectory
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness, smoothness_terms
 from protocols.geometry.types import Floats
 from tests.support.bundles import observed, spline_of
@@ -138,3 +141,31 @@ def test_one_std_for_three_axes_covers_95_percent() -> None:
     assert stds_found[0] == pytest.approx(1.0, rel=1e-4)
     assert equivalent_std(np.zeros((2, 3))).tolist() == [0.0, 0.0]
     assert equivalent_std(1e-9 * axes) == pytest.approx(1e-9 * stds_found, rel=1e-6)
+
+
+def test_the_shares_that_observations_determine_are_those_of_a_dense_inverse() -> None:
+    problem, state = two_cameras(1, until=6.0)
+    prior = estimate_smoothness(problem, state)
+    found = with_noise(problem, state, prior).trajectories[0].determined
+    held_cameras = replace(problem, free_parameters=FreeParameters(pose=False, clock=False))
+    band = build_system(held_cameras, state, prior, robust=False)[0].band
+    size = band.shape[1]
+    dense = np.zeros((size, size))
+    for distance in range(BAND):
+        column = np.arange(distance, size)
+        dense[column - distance, column] = dense[column, column - distance] = band[BAND - 1 - distance, column]
+    covariance = np.linalg.inv(dense)
+    path, (weight, scatter) = state.trajectories[0], prior.of(0)
+    assert scatter is not None
+    control = path.control[scatter.control_mask] - path.control[scatter.control_mask].mean(axis=0)
+    metric = scatter.scale * np.linalg.inv(control.T @ control / len(control) + scatter.floor * np.eye(3))
+    left = []
+    for start, one in zip(path.basis.interval_starts(), weight, strict=True):
+        difference = np.zeros((3, size))
+        for k, coefficient in enumerate(THIRD_DIFFERENCE):
+            difference[range(3), range(3 * (start + k), 3 * (start + k) + 3)] = coefficient
+        left.append(one * np.trace(metric @ difference @ covariance @ difference.T) / 3.0)
+    assert found == pytest.approx(1.0 - np.array(left)[scatter.held].mean(), rel=1e-9)
+    assert 0.0 < found < 1.0
+    doubled = replace(state, trajectories=(replace(path, determined=0.5),))
+    assert estimate_smoothness(problem, doubled).weights[0] == pytest.approx(0.5 * weight)
