@@ -102,7 +102,7 @@ def test_of_people_before_and_after_a_clock_was_set_the_longer_side_counts(tmp_p
 
 def test_people_in_a_log_who_wear_one_colour_are_told_by_where_they_are(tmp_path: Path) -> None:
     scene = scenes.get_people_scene(9505, 3, 3)
-    traffic = film(scene, 30.0, 9505)
+    traffic = film(scene, 22.0, 9505)
     for _, message in traffic.arrivals:
         for one in message.detections:
             one.colour.CopyFrom(pb.Colour(red=90, green=90, blue=90))

@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hub.calibration.people import unlabelled
-from hub.calibration.people.ground_plane import Bodies, estimate_ground_plane
+from hub.calibration.people.ground_plane import Bodies, GroundPlane, estimate_ground_plane
 from hub.calibration.people.registration import GroundPoints, lag_grid, register, rotation
-from hub.calibration.people.unlabelled import calibrate_people
+from hub.calibration.people.unlabelled import _check_upright, calibrate_people
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
 from protocols.geometry import so3
@@ -20,6 +19,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
+from protocols.session.observations import Observations
 from protocols.session.rig import Rig, RigCamera
 from tests.support import crowds
 
@@ -159,9 +159,15 @@ def errors(found: Calibration) -> tuple[Floats, Floats]:
     return np.linalg.norm(scale * x @ world - y, axis=1), np.array(rotations)
 
 
-def test_unlabelled_people_calibrate_cameras_that_share_no_clock() -> None:
-    rig, messages = session(40.0, OFFSETS)
-    found, observations = calibrate_people(rig, messages)
+@pytest.fixture(scope="module", name="calibrated")
+def _calibrated() -> tuple[Calibration, Observations]:
+    return calibrate_people(*session(40.0, OFFSETS))
+
+
+def test_unlabelled_people_calibrate_cameras_that_share_no_clock(
+    calibrated: tuple[Calibration, Observations],
+) -> None:
+    found, observations = calibrated
     assert not found.refused
     positions, rotations = errors(found)
     assert positions.max() < 0.15
@@ -188,11 +194,14 @@ def test_cameras_that_are_apart_on_a_shared_clock_are_refused() -> None:
         calibrate_people(Rig(rig.cameras, clock="shared"), messages)
 
 
-def test_people_who_would_lean_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig, messages = session(40.0, OFFSETS)
-    monkeypatch.setattr(unlabelled, "_MAX_LEAN_DEG", 0.01)  # of what is right 0.2 to 0.7
-    with pytest.raises(Refused, match="people would lean by 0"):
-        calibrate_people(rig, messages)
+def test_people_who_would_lean_are_refused(calibrated: tuple[Calibration, Observations]) -> None:
+    def planes(lean_deg: float) -> dict[str, GroundPlane]:
+        up = so3.exp(np.array([np.deg2rad(lean_deg), 0.0, 0.0])) @ np.array([0.0, 0.0, 1.0])
+        return {name: GroundPlane(pose.rotation @ up, 1.7) for name, pose in crowds.poses().items()}
+
+    _check_upright(calibrated[0], planes(0.0))
+    with pytest.raises(Refused, match=r"people would lean by [34]"):
+        _check_upright(calibrated[0], planes(4.0))
 
 
 def test_a_camera_without_a_measured_lens_is_refused_by_name() -> None:
