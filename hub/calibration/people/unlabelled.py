@@ -150,8 +150,12 @@ def _contradictions(reconstruction: Reconstruction) -> tuple[str, ...]:
 
 def _check_upright(found: Calibration, planes: Mapping[str, GroundPlane]) -> None:
     """Raise Refused where the vertical of each picture is not that of the plane in which each head, or foot, moves."""
-    paths = [table.position[np.isfinite(table.position).all(axis=1)] for table in found.trajectories]
-    levels = [path - np.median(path, axis=0) for path in paths if len(path)]  # of children, too
+    levels = []
+    for table in found.trajectories:
+        known = np.isfinite(table.position).all(axis=1)
+        path, std = table.position[known], table.std[known]
+        if len(path):  # of children, too; an end that one camera sees flies off under a large std
+            levels.append((path - np.median(path, axis=0)) / np.maximum(std, np.median(std))[:, None])
     spread, axes = np.linalg.svd(np.concatenate(levels), full_matrices=False)[1:]
     if spread[1] < _MIN_WIDTH * spread[0]:  # all on one line: no plane
         return

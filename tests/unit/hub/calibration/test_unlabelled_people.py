@@ -199,9 +199,16 @@ def test_people_who_would_lean_are_refused(calibrated: tuple[Calibration, Observ
         up = so3.exp(np.array([np.deg2rad(lean_deg), 0.0, 0.0])) @ np.array([0.0, 0.0, 1.0])
         return {name: GroundPlane(pose.rotation @ up, 1.7) for name, pose in crowds.poses().items()}
 
-    _check_upright(calibrated[0], planes(0.0))
+    found = calibrated[0]
+    _check_upright(found, planes(0.0))
+    first, *others = found.trajectories
+    position, std = first.position.copy(), first.std.copy()
+    camera = found.cameras["left"]
+    position[-20:] += 3.0 * (camera.pose.rotation.T @ planes(0.0)["left"].up)  # an end that one camera sees
+    std[-20:] = 3.0
+    _check_upright(replace(found, trajectories=(replace(first, position=position, std=std), *others)), planes(0.0))
     with pytest.raises(Refused, match=r"people would lean by [34]"):
-        _check_upright(calibrated[0], planes(4.0))
+        _check_upright(found, planes(4.0))
 
 
 def test_a_camera_without_a_measured_lens_is_refused_by_name() -> None:
