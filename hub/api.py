@@ -159,7 +159,7 @@ class TriangulationResult:
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedSession(Session):
     """A session as it was recorded. clock_priors: external clock priors (NTP, PTP) of its cameras, by name. people:
-    detections of several unlabelled people; observations are then those of people told by colour, if any."""
+    detections of several unlabelled people; observations are then of those associated by colour."""
 
     clock_priors: Mapping[str, ExternalClockPrior] = field(default_factory=dict)
     people: tuple[pb.Observation, ...] = field(default=(), kw_only=True)

@@ -150,7 +150,7 @@ class ObservationStream:
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedStream:
     """The session that a hub would have after the messages of a log. priors: external ones of its cameras' clocks.
-    people: the detections of several unlabelled people; observations are then those of people told by colour, if any.
+    people: the detections of several unlabelled people; observations are then of those associated by colour.
     """
 
     rig: Rig
@@ -186,7 +186,7 @@ def session_from_messages(messages: Iterable[Message]) -> RecordedStream:
     rig, observations = stream.build(of_marker, refusing=not people)
     source = stream.marker if of_marker else stream.people
     boots = {name: source.boot(name) for name in rig.cameras}
-    if people:  # those told by colour are of the last boot ids: a prior has to be of both
+    if people:  # those associated by colour are of the last boot ids: a prior has to be of both
         boots = {name: boot for name, boot in boots.items() if longest.get(name) == boot}
     alarms = tuple(
         f"{text}: its rows on one side of that were left out"

@@ -269,7 +269,7 @@ def _empty_frames(stamps: Ints, frames: Ints) -> tuple[Ints, Ints]:
 def without_clock_steps(messages: list[pb.Observation], file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
     """The messages on the longer side of a step of their camera's clock, as `calibrate` takes it; and warnings.
 
-    A clock that was set back is told by the frames' numbers, if these increase.
+    A clock that was set back shows in the frames' numbers, if these increase.
 
     Raises InputError where the frames of all cameras are too far apart.
     """
