@@ -106,7 +106,7 @@ def _input_from_folder(folder: Path, session: Path | None) -> ReportInput:
     cameras = {name: _with_lag(camera, _table(document.get("cameras"))) for name, camera in cameras.items()}
     file = folder / TRAJECTORY
     tables = read_trajectory(file) if file.exists() else ()
-    if len(observations) and tables and not {table.label for table in tables} & set(observations.labels):
+    if place is not None and tables and not {table.label for table in tables} & set(observations.labels):
         missing = "its points are of people who were followed: figures of the observations are left out"
         observations = Observations({}, (missing,))
     calibration = Calibration(

@@ -295,9 +295,9 @@ def _image(used: dict[str, RowUsage]) -> list[QualityFinding]:
                 "Move the point through more of the image of " + _listed(list(little)) + ".",
             )
         )
-    if not out and used:
-        least = min(rows.coverage for rows in used.values())
-        out.append(QualityFinding("good", f"The point passed through {100 * least:.0f} % or more of every image."))
+    seen = [rows.coverage for rows in used.values() if rows.used]
+    if not out and seen:
+        out.append(QualityFinding("good", f"The point passed through {100 * min(seen):.0f} % or more of every image."))
     return out
 
 

@@ -78,6 +78,7 @@ def test_without_the_session_the_rest_is_still_reported(
     assert (expected["level"], expected["attention"]) == ("good", []), "it says nothing about the result"
     text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "its session is not found" in text.lower()
+    assert "passed through" not in text
     assert "<h2>Clock offsets" in text
 
 
