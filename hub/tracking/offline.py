@@ -132,6 +132,7 @@ def _tracked(
         if state.scan is not None and any(one.frame.camera.name == frame.camera.name for one in state.scan.frames):
             state = jointly(state, parameters)
             recorded.append(_recorded(state))
+            state = replace(state, scan=None)  # who was taken for whom is the smoother's, which knows the future
         state = process_frame(state, frame, cameras, parameters)
         if index % 50 == 0:
             progress(index / len(frames))

@@ -17,7 +17,7 @@ from hub.tracking.association.assignment import colour_score, matching_colour_st
 from hub.tracking.association.continuation import EntryExitRates, continuation_scores
 from hub.tracking.association.scan import FrameEvidence, associate_jointly
 from hub.tracking.filter.floor import Floor
-from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, fused
+from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, fused, with_information
 from hub.tracking.filter.prediction import (
     continuation_hypotheses,
     fused_predictions,
@@ -234,7 +234,8 @@ class BatchSmoother:
             predicted, elapsed = self._predicted(out[-1] if out else None, rows, index, direction)
             said = self.evidence[index].total(rows)
             manoeuvre = manoeuvre_hypothesis(predicted, elapsed, units, up, posture=True)
-            mean, covariance = _updated(predicted.mean, widened_by_evidence(predicted, manoeuvre, *said), *said)
+            widened = widened_by_evidence(predicted, manoeuvre, *said)
+            mean, covariance, _ = with_information(predicted.mean, widened, *said)
             out.append(_Filtered(rows, mean, covariance[:, *_TRIANGLE]))
         return out[::direction]
 
@@ -274,7 +275,7 @@ class BatchSmoother:
                 past, mean=mean, covariance=covariance,
                 existence=np.where(inside, _INSIDE, _BESIDE), initiation_number=row,
             )  # fmt: skip
-            mean, covariance = _updated(mean, covariance, *self.evidence[index].total(row))
+            mean, covariance, _ = with_information(mean, covariance, *self.evidence[index].total(row))
             there = replace(prior, mean=mean, covariance=covariance)
             found = associate_jointly(
                 scan.frames, there, scan.now_ns, prior, self.parameters.up, self.colour_std,
@@ -429,10 +430,11 @@ class BatchSmoother:
         self._changed[index] = True
 
     def _rename(self, index: int, names: Ints) -> None:
-        scan = self.scans[index]
+        scan, found = self.scans[index], self.evidence[index]
+        if np.array_equal(names[found.row], found.row):
+            return
         frames = tuple(replace(one, ids=names[one.ids]) for one in scan.frames)
         self.scans[index] = replace(scan, frames=frames)
-        found = self.evidence[index]
         self.evidence[index] = replace(found, row=names[found.row])
 
     def _select(self, source: list[int]) -> None:
@@ -535,12 +537,3 @@ def _places(rows: Ints, wanted: Ints) -> Ints:
     """Where each of ``wanted`` is in ``rows``, -1 = nowhere."""
     place = {track: at for at, track in enumerate(rows.tolist())}
     return np.array([place.get(track, -1) for track in wanted.tolist()], dtype=np.int64)
-
-
-def _updated(mean: Floats, covariance: Floats, information: Floats, vector: Floats) -> tuple[Floats, Floats]:
-    """States with the evidence of a scan."""
-    prior = np.linalg.inv(covariance)
-    vector = (prior @ mean[:, :, None])[:, :, 0] + vector
-    inverse = np.linalg.inv(prior + information)
-    covariance = 0.5 * (inverse + inverse.transpose(0, 2, 1))
-    return (covariance @ vector[:, :, None])[:, :, 0], covariance

@@ -15,7 +15,7 @@ import numpy as np
 from hub.tracking.association.assignment import colour_score
 from hub.tracking.association.scan import FrameEvidence, ScanResult, associate_jointly
 from hub.tracking.filter.floor import Floor
-from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, log_density
+from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, log_density, with_information
 from hub.tracking.filter.prediction import (
     log_evidence,
     log_mixture,
@@ -136,10 +136,9 @@ def _updated(
     )
     fit = log_mixture(change.prior_odds, smooth, changed)
     fit = fit + sum(colour_score(one, predicted.colour, colour_std) for one in colours)
-    inverse = np.linalg.inv(widened_by_evidence(predicted, change, *measured))
-    covariance = np.linalg.inv(inverse + said.information)
-    mean = (covariance @ ((inverse @ predicted.mean[:, :, None])[:, :, 0] + said.vector)[:, :, None])[:, :, 0]
-    return fit, replace(predicted, mean=mean, covariance=0.5 * (covariance + covariance.transpose(0, 2, 1)))
+    widened = widened_by_evidence(predicted, change, *measured)
+    mean, covariance, _ = with_information(predicted.mean, widened, *measured)
+    return fit, replace(predicted, mean=mean, covariance=covariance)
 
 
 def _decided(encounters: Encounters, targets: Targets) -> tuple[Encounters, Targets]:

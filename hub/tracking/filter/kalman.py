@@ -61,7 +61,7 @@ def update(
     new = i_minus_kh @ covariance @ i_minus_kh.transpose(0, 2, 1) + gain @ noise @ gain.transpose(0, 2, 1)
     moved = mean + (gain @ innovation[:, :, None])[:, :, 0]
     squared = (innovation * solved[:, :, STATE_DIM]).sum(axis=1)
-    return moved, 0.5 * (new + new.transpose(0, 2, 1)), squared, np.linalg.slogdet(total)[1]
+    return moved, _symmetric(new), squared, np.linalg.slogdet(total)[1]
 
 
 def fit(innovation: Floats, total: Floats, used: Bools) -> tuple[Floats, Floats]:
@@ -102,7 +102,26 @@ def log_density(off: Floats, covariance: Floats) -> Floats:
 
 def fused(mean: Floats, covariance: Floats, other_mean: Floats, other_covariance: Floats) -> tuple[Floats, Floats]:
     """Two independent estimates (n, 7), (n, 7, 7) of the same states as one."""
-    one, two = np.linalg.inv(covariance), np.linalg.inv(other_covariance)
-    both = np.linalg.inv(one + two)
-    both = 0.5 * (both + both.transpose(0, 2, 1))
-    return (both @ (one @ mean[:, :, None] + two @ other_mean[:, :, None]))[:, :, 0], both
+    right = np.concatenate([other_covariance, (other_mean - mean)[:, :, None]], axis=2)
+    out = covariance @ np.linalg.solve(covariance + other_covariance, right)
+    return mean + out[:, :, STATE_DIM], _symmetric(out[:, :, :STATE_DIM])
+
+
+def with_information(
+    mean: Floats, covariance: Floats, information: Floats, vector: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """States (n, 7), (n, 7, 7) after measurements given by their information (n, 7, 7) and its vector (n, 7).
+
+    Also the log likelihoods (n,) of the measurements, but for what does not depend on the state.
+    """
+    factor = np.eye(STATE_DIM) + covariance @ information
+    right = np.concatenate([covariance, (mean + (covariance @ vector[:, :, None])[:, :, 0])[:, :, None]], axis=2)
+    out = np.linalg.solve(factor, right)
+    posterior = out[:, :, STATE_DIM]
+    left = vector - (information @ posterior[:, :, None])[:, :, 0]
+    likelihood = 0.5 * ((mean * left + vector * posterior).sum(axis=1) - np.linalg.slogdet(factor)[1])
+    return posterior, _symmetric(out[:, :, :STATE_DIM]), likelihood
+
+
+def _symmetric(covariance: Floats) -> Floats:
+    return np.asarray(0.5 * (covariance + covariance.transpose(0, 2, 1)))

@@ -169,12 +169,7 @@ def _mixed(covariance: Floats, hypothesis: ManoeuvreHypothesis, smooth: Floats, 
 
 def log_evidence(mean: Floats, covariance: Floats, information: Floats, vector: Floats) -> Floats:
     """Log likelihood (n,) of measurements in information form, but for what does not depend on the prior."""
-    prior = np.linalg.inv(covariance)
-    total = prior + information
-    both = (prior @ mean[:, :, None])[:, :, 0] + vector
-    squared = (both * np.linalg.solve(total, both[:, :, None])[:, :, 0]).sum(axis=1)
-    squared -= np.einsum("ni,nij,nj->n", mean, prior, mean)
-    return np.asarray(0.5 * (squared + np.linalg.slogdet(prior)[1] - np.linalg.slogdet(total)[1]))
+    return kalman.with_information(mean, covariance, information, vector)[2]
 
 
 def gpb1_update(

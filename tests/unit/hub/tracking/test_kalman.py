@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from hub.tracking.filter import kalman
 from protocols.geometry.types import Floats
@@ -107,3 +108,30 @@ def test_covariances_stay_symmetric_and_positive(noise: float) -> None:
     assert np.isfinite(covariance).all()
     np.testing.assert_array_equal(covariance[0], covariance[0].T)
     assert np.linalg.eigvalsh(covariance[0]).min() > -1e-9 * np.abs(covariance).max()
+
+
+def test_information_of_measurements_against_marginal_densities() -> None:
+    """Three rows measured by two states: posterior by inverses, likelihood by scipy's density of the measurement."""
+    rng = np.random.default_rng(3)
+    (mean, covariance), (other, spread) = prior(), prior()
+    other = other + rng.normal(size=other.shape)
+    jacobian, noise = rng.normal(size=(3, STATE_DIM)), np.diag([0.1, 0.4, 2.0])
+    value = rng.normal(size=3)
+    information = (jacobian.T @ np.linalg.solve(noise, jacobian))[None]
+    vector = (jacobian.T @ np.linalg.solve(noise, value))[None]
+    densities = []
+    for at, around in ((mean, covariance), (other, 3.0 * spread)):
+        total = jacobian @ around[0] @ jacobian.T + noise
+        densities.append(multivariate_normal(jacobian @ at[0], total).logpdf(value))
+    found = [
+        kalman.with_information(*each, information, vector) for each in ((mean, covariance), (other, 3.0 * spread))
+    ]
+    assert found[0][2] - found[1][2] == pytest.approx(densities[0] - densities[1], abs=1e-9)
+    inverse = np.linalg.inv(np.linalg.inv(covariance[0]) + information[0])
+    assert found[0][1][0] == pytest.approx(inverse, abs=1e-9)
+    assert found[0][0][0] == pytest.approx(inverse @ (np.linalg.solve(covariance[0], mean[0]) + vector[0]), abs=1e-9)
+    both, variance = kalman.fused(mean, covariance, other, 3.0 * spread)
+    inverse = np.linalg.inv(np.linalg.inv(covariance[0]) + np.linalg.inv(3.0 * spread[0]))
+    assert variance[0] == pytest.approx(inverse, abs=1e-9)
+    weighted = np.linalg.solve(covariance[0], mean[0]) + np.linalg.solve(3.0 * spread[0], other[0])
+    assert both[0] == pytest.approx(inverse @ weighted, abs=1e-9)
