@@ -17,9 +17,9 @@ _CONFIRMED_ROWS = 3
 def rows_of_one_target(rows: Sequence[str]) -> tuple[tuple[str, ...], int, int]:
     """The rows of a video's only target, how many others were removed, and how many targets there are.
 
-    rows: of observations.csv. The target's track may have been lost in between: labels that are never seen at one time
-    are it, the longest first, and get the name of their kind. With more than one target no rows are left, and all
-    labels count that are more than false detections.
+    rows: of observations.csv. The target's track may have been lost in between: labels that are mostly seen while no
+    other is (a track may go on for some frames beside its successor) are it, the longest first, and get the name of
+    their kind. With more than one target no rows are left, and all labels count that are more than false detections.
     """
     labels: dict[str, dict[str, int]] = defaultdict(dict)
     cells = list(csv.reader(rows))
@@ -34,9 +34,11 @@ def rows_of_one_target(rows: Sequence[str]) -> tuple[tuple[str, ...], int, int]:
     beside: list[int] = []
     for one in ordered[1:]:
         same = cells[kept[0]][kind] == cells[min(one.values())][kind]
-        if same and len(one) >= _CONFIRMED_ROWS and frames.isdisjoint(one):
+        twice = frames & one.keys()
+        if same and len(one) >= _CONFIRMED_ROWS and 2 * len(twice) < len(one):
+            kept = sorted([*kept, *(index for frame, index in one.items() if frame not in twice)])
             frames |= set(one)
-            kept = sorted([*kept, *one.values()])
+            beside.append(len(twice))
         else:
             beside.append(len(one))
     if sum(beside) > SEVERAL_SHARE * len(kept):

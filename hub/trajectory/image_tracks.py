@@ -119,7 +119,10 @@ def smooth_track(
         return None
     rows = np.flatnonzero(usable)
     t, x = shifted[rows], normalised[rows]
+    # Relative to the track's own typical row: what a fit absorbs is known for weights about 1.
     std = np.ones(len(rows)) if relative_std is None else relative_std[rows]
+    typical = median(std)
+    std = std / typical
     good = neighbour_test(t, x, floor=_MIN_OUTLIER_PX / focal)
     interval = median(np.diff(t))
     gap = max(BRIDGED_GAP_S, BRIDGED_INTERVALS * interval)
@@ -141,7 +144,7 @@ def smooth_track(
                 best = fit
     if best is None:
         return None
-    basis, control, inlier, sigma = best.basis, best.control, best.inlier, best.sigma
+    basis, control, inlier, sigma = best.basis, best.control, best.inlier, best.sigma / typical
     mask = np.zeros(len(time), dtype=np.bool_)
     mask[rows[inlier]] = True
     return SmoothTrack(origin, t[inlier], x[inlier], mask, basis, control, sigma, focal, discontinuities)

@@ -127,8 +127,8 @@ def _detections(
                 low = np.minimum(box[:2], boxes[k][:2])
                 box = np.concatenate([low, np.maximum(box[:2] + box[2:], boxes[k][:2] + boxes[k][2:]) - low])
                 gone.add(k)
-        head, foot = pixels[one, 0], pixels[one, [13, 14, 17, 18]]
-        foot = foot[np.argmax(foot[:, 1])]
+        head, feet = pixels[one, 0], pixels[one, [13, 14, 17, 18]]
+        foot = np.array([feet[:, 0].mean(), feet[:, 1].max()])  # as the detectors have it: below the middle of the feet
         merged = not np.array_equal(box, boxes[one])
         top = np.array([box[0] + 0.5 * box[2], box[1]]) if merged else head
         point = pixels[one, 3] * 0.75 + pixels[one, 4] * 0.25  # between chest and pelvis

@@ -37,6 +37,13 @@ def test_a_track_that_was_lost_in_between_is_one_target() -> None:
     assert _labels(rows) == [(frame, "person") for frame in (*range(50), *range(60, 100))]
 
 
+def test_a_track_that_goes_on_for_some_frames_beside_its_successor_is_one_target() -> None:
+    rows, removed, targets = rows_of_one_target(_rows(("p0", range(100, 200)), ("p1", range(108))))
+    assert (removed, targets) == (8, 1)
+    assert _labels(rows) == [(frame, "person") for frame in range(200)]
+    assert rows_of_one_target(_rows(("p0", range(100, 200)), ("p1", range(130)))) == ((), 0, 2)
+
+
 def test_more_than_a_tenth_beside_it_is_a_second_target() -> None:
     assert rows_of_one_target(_rows(("p0", range(100)), ("p1", range(20, 31)))) == ((), 0, 2)
     assert rows_of_one_target(_rows(("p0", range(100)), ("p1", range(20, 30))))[1:] == (10, 1)

@@ -195,6 +195,19 @@ def test_the_callers_arrays_are_not_changed() -> None:
     np.testing.assert_array_equal(points, before[1])
 
 
+@pytest.mark.parametrize("typical", [0.2, 5.0])
+def test_a_track_more_or_less_exact_than_the_cameras_others_is_smoothed_as_if_alone(typical: float) -> None:
+    """A head beside its foot: what a fit absorbs was counted as for rows of the camera's typical noise, so the head's
+    knots were chosen twice as dense as its frames, and its path followed every row."""
+    time, points, _ = track(5, fps=10.0, noise_px=2.0)
+    alone = smoothed(time, points)
+    found = smooth_track(time, points, FOCAL, relative_std=np.full(len(time), typical))
+    assert found is not None
+    assert found.basis.spacing == alone.basis.spacing
+    np.testing.assert_allclose(found.control, alone.control, rtol=1e-9, atol=1e-12)
+    assert found.sigma == pytest.approx(alone.sigma / typical)
+
+
 def test_the_neighbour_test_tolerates_forty_percent_of_outliers() -> None:
     time, points, _ = track(13, seconds=60)
     rng = np.random.default_rng(2)
