@@ -83,12 +83,12 @@ class AdaptiveTracker:
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
         """Track the target into the next frame; ``None`` for a frame that could not be decoded.
 
-        An image that repeats one with the target has that one's estimate: it says nothing of the time since.
+        An image that repeats the last one has that one's estimate: it says nothing of the time since.
         """
         image = None if image is None else self._stretched(image)
-        if image is not None and self._last.state is TrackState.VISIBLE and is_repeated(self._viewed, image):
-            recent = time - self._viewed_at <= _REPEATED_S
-            return replace(self._last, time=time, state=TrackState.VISIBLE if recent else TrackState.COASTING)
+        recent, seen = time - self._viewed_at <= _REPEATED_S, self._last.state is TrackState.VISIBLE
+        if image is not None and (recent or seen) and is_repeated(self._viewed, image):
+            return replace(self._last, time=time, state=self._last.state if recent else TrackState.COASTING)
         if image is not None:
             self._viewed, self._viewed_at = image, time
         self._last = self._follow(image, time)
