@@ -25,7 +25,7 @@ def make_tracker(
     Raises InputError for an unknown name.
     """
     if name == "ground":
-        from edge.uav.black_bars import WithoutBars
+        from edge.uav.adaptive_tracker import WithoutBars
 
         return WithoutBars(size, lens, body_from_camera, fps, seed)
     if name == "paper":

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from edge.uav.base import Estimate, Telemetry
-from edge.uav.black_bars import picture_area
+from edge.uav.image_motion.black_bars import picture_area
 from edge.uav.tracker_factory import make_tracker
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Image
