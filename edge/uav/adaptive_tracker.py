@@ -230,18 +230,16 @@ class AdaptiveTracker:
 
 
 class WithoutBars:
-    """``AdaptiveTracker`` of the picture in an image; its arguments, and all pixels in and out, are of the image."""
+    """``AdaptiveTracker`` of the picture in an image; its arguments, and all pixels in and out, are of the image.
+
+    others: body_from_camera, fps and seed.
+    """
 
     def __init__(
-        self,
-        size: tuple[int, int],
-        lens: Intrinsics | None = None,
-        body_from_camera: Floats | None = None,
-        fps: float = 30.0,
-        seed: int = 0,
+        self, size: tuple[int, int], lens: Intrinsics | None, others: tuple[Floats | None, float, int]
     ) -> None:
-        self._size, self._lens, self._others = size, lens, (body_from_camera, fps, seed)
-        self._tracker = AdaptiveTracker(size, lens, *self._others)
+        self._size, self._lens, self._others = size, lens, others
+        self._tracker = AdaptiveTracker(size, lens, *others)
         self._samples: list[Telemetry] = []
         self._area = (0, 0, *size)
 

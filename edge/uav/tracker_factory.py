@@ -27,7 +27,7 @@ def make_tracker(
     if name == "ground":
         from edge.uav.adaptive_tracker import WithoutBars
 
-        return WithoutBars(size, lens, body_from_camera, fps, seed)
+        return WithoutBars(size, lens, (body_from_camera, fps, seed))
     if name == "paper":
         from edge.uav.baselines.paper_tracker import PaperTracker
 
