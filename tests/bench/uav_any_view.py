@@ -2,7 +2,7 @@
 
     python -m tests.bench.uav_any_view [--models ground,csrt,kcf,mosse] [--seeds 1] [--kinds oblique]
         [--first-seed 0] [--ranges 1,2.5,4] [--screens 0] [--covered] [--group] [--first-start 0] [--mirrored 0.6]
-        [--light dusk] [--copies 1] [--stabilisation] [--json]
+        [--light dusk] [--changed bars] [--every 1] [--copies 1] [--stabilisation] [--json]
 
 Rendered oblique flights with truth, and where the data folder has them real ones: whole sequences, and windows that pan
 away from the target for 0.5 to 4 s and come back. No lens, no telemetry.
@@ -15,6 +15,7 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -26,10 +27,21 @@ from edge.uav.image_motion.scene_motion import SceneMotion
 from protocols.geometry.types import Floats, Image
 from tests.bench import uav_rivals
 from tests.bench.real_rigs import DEFAULT_DATA
-from tests.bench.uav_sequences import AWAY_S, Sequence, aerial, mirrored, oblique, pan_away, share_inside
+from tests.bench.uav_sequences import (
+    AWAY_S,
+    Sequence,
+    aerial,
+    barred,
+    mirrored,
+    oblique,
+    pan_away,
+    share_inside,
+    zoomed,
+)
 from tests.support.oblique.world import FLIGHTS, TARGETS, ObliqueWorld
 
 MODELS = ("ground", *uav_rivals.NAMES)
+CHANGES = {"none": lambda sequence: sequence, "bars": barred, "zoom": zoomed}
 NEAR_PX, HELD_FRAMES = 20.0, 20
 _RATES = (10.0, 15.0, 30.0)
 _COVERED = (0.4, 0.85)  # share of a target that is seen in a first box that shows a screen before it
@@ -265,6 +277,8 @@ def main() -> None:
     parser.add_argument("--mirrored", type=float, help="windows of the mirrored clips, reduced to this share: 0.6")
     parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
     parser.add_argument("--light", default="", help="change the images: dusk, haze, flicker")
+    parser.add_argument("--every", type=int, default=1, help="only every so many sequences")
+    parser.add_argument("--changed", choices=CHANGES, default="none", help="black bars; a zoom by 2 within one frame")
     parser.add_argument(
         "--copies", type=int, default=1, help="of each sequence, all but one with a grey level of noise"
     )
@@ -293,10 +307,9 @@ def main() -> None:
     scores = [
         run(replace(s, images=[in_light(i, light, k) for k, i in enumerate(s.images)]) if light else s, model)
         for source in sources
-        for original in source
-        if not kinds or original.kind in kinds
+        for original in islice((one for one in source if not kinds or one.kind in kinds), 0, None, options.every)
         for copy in range(options.copies)
-        for s in (grained(original, copy),)
+        for s in (CHANGES[options.changed](grained(original, copy)),)
         for model in models
     ]
     if options.json:

@@ -84,6 +84,24 @@ def mirrored(whole: Sequence, factor: float) -> Sequence:
     return replace(whole, images=[np.asarray(image, np.uint8) for image in images], box=box)
 
 
+def barred(whole: Sequence, rows: int = 40) -> Sequence:
+    """A sequence between black bars above and below, this many rows high."""
+    images = [cv2.copyMakeBorder(image, rows, rows, 0, 0, cv2.BORDER_CONSTANT) for image in whole.images]
+    return replace(whole, images=[np.asarray(image, np.uint8) for image in images], box=whole.box + [0.0, rows, 0, 0])
+
+
+def zoomed(whole: Sequence, factor: float = 2.0) -> Sequence:
+    """A sequence that is zoomed in within one frame after a third of it, the view about the target from then on."""
+    size, first = np.array(whole.size, dtype=np.float64), len(whole.images) // 3 + 1
+    images, box = list(whole.images), whole.box.copy()
+    for k in range(first, len(images)):
+        middle = np.clip(box[k, :2] + 0.5 * box[k, 2:], 0.5 * size / factor, size - 0.5 * size / factor)
+        matrix = np.column_stack([factor * np.eye(2), 0.5 * size - factor * middle])
+        images[k] = np.asarray(cv2.warpAffine(images[k], matrix, whole.size), np.uint8)
+        box[k] = [*(factor * box[k, :2] + matrix[:, 2]), *(factor * box[k, 2:])]
+    return replace(whole, images=images, box=box, visible=share_inside(box, whole.size) * (whole.visible >= 0.5))
+
+
 def aerial(folder: Path) -> Iterator[Sequence]:
     """Every car of the aerial-traffic video that stays for all of it; whole frames."""
     images, _ = read_video(folder / "traffic.mp4")

@@ -31,6 +31,8 @@ _BENT = 0.04  # of the shift by a turn: mean of (x/f)^2 over half an image as wi
 _MIN_TRACKS, _MIN_SHARE = 12, 0.35  # of a trusted motion: static tracks, and their share
 _MOST_STAND = 0.5  # share of the tracks off what seems burnt in, that move alike where it is
 _PARTS, _VOTE_PX = (4, 2), 2  # parts that are searched after a fast pan; agreement of their shifts [px, reduced]
+_FEATURES, _FEATURE_STEP = 800, 7  # that are matched: number, and grey levels by which they stand out of dull ground
+_MOST_ZOOM = 2.5  # in one step: a stage of a drone's zoom is 2
 _PARALLAX_PX = 6.0  # largest correction [px of the working image]
 _PARALLAX_PRIOR = (1.0, 2.0, 2.0)  # tracks that say there is none, and that it does not grow
 _REACH = 0.3  # of the parallax correction, over the image's width
@@ -102,7 +104,7 @@ class SceneMotion:
         self._gray: Gray | None = None
         self._burnt_in = BurntIn(self._size)
         self.photometric = PhotometricGain(1)
-        self._last = np.eye(2, 3)
+        self._last, self._followed = np.eye(2, 3), True
         self.reach = _REACH * size[0]
         """Distance over which parallax is taken to be alike [px]."""
 
@@ -123,6 +125,8 @@ class SceneMotion:
                 like = _times(gray, cv2.mean(previous)[0] / max(cv2.mean(gray)[0], 1.0))
                 coarse = self._coarse_shift(previous, gray)
                 motion = max(motion, self._fit(*self._flow(previous, like, corners, coarse)), key=lambda one: one.share)
+                if self._followed and not motion.trusted:  # else, as over plain water, it would cost as much again
+                    motion = max(motion, self._fit(*self._matched(previous, like)), key=lambda one: one.share)
         if not motion.trusted:
             self._burnt_in.restart()
         elif self._burnt_in.contradicts(gray, self._to_working(motion.matrix)):
@@ -133,6 +137,7 @@ class SceneMotion:
             tracks = self._flow(previous, _times(gray, change), corners, self._to_working(motion.matrix))
             motion = max(motion, self._fit(*tracks), key=lambda one: one.share)
         self._last = self._to_working(motion.matrix) if motion.trusted else np.eye(2, 3)
+        self._followed = motion.trusted
         return motion
 
     def _filled(self, gray: Gray) -> Gray:
@@ -182,6 +187,25 @@ class SceneMotion:
         good &= np.square(back - corners).sum(axis=1) < _BACKWARD_PX**2
         return corners[good].astype(np.float64), moved[good].astype(np.float64)
 
+    def _matched(self, old: Gray, new: Gray) -> tuple[Floats, Floats]:
+        """As ``_flow``, of a picture that zooms or turns in one step: as matched features have it, then by the flow."""
+        orb = cv2.ORB.create(_FEATURES, fastThreshold=_FEATURE_STEP)
+        (at, bits), (at_new, bits_new) = (orb.detectAndCompute(image, self._burnt_in.mask) for image in (old, new))
+        none = np.zeros((0, 2)), np.zeros((0, 2))
+        if bits is None or bits_new is None:
+            return none
+        pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(bits, bits_new)
+        if len(pairs) < _MIN_TRACKS:
+            return none
+        ends = np.array([at[p.queryIdx].pt for p in pairs]), np.array([at_new[p.trainIdx].pt for p in pairs])
+        start, _ = cv2.estimateAffinePartial2D(ends[0], ends[1], ransacReprojThreshold=2.0 * _RANSAC_PX)
+        if start is None or abs(np.linalg.det(start[:, :2])) < 1.0 / _MOST_ZOOM**2:
+            return none
+        # The flow compares windows, which must show the same at the same size.
+        seen = np.asarray(cv2.warpAffine(old, start, self._size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        tracks, moved = self._flow(seen, new, self._corners(seen, None), np.eye(2, 3))
+        return (tracks - start[:, 2]) @ np.linalg.inv(start[:, :2]).T, moved
+
     def _fit(self, old: Floats, new: Floats) -> Motion:
         if len(old) < _MIN_TRACKS:
             return STILL
@@ -198,7 +222,7 @@ class SceneMotion:
         residual = new - (old @ matrix[:, :2].T + matrix[:, 2])
         near = np.square(residual).sum(axis=1) < (tolerance * _PARALLAX_PX) ** 2
         zoom = float(np.hypot(matrix[0, 0], matrix[1, 0]))
-        trusted = bool(int(mask.sum()) >= _MIN_TRACKS and share > _MIN_SHARE and 0.5 < zoom < 2.0)
+        trusted = bool(int(mask.sum()) >= _MIN_TRACKS and share > _MIN_SHARE and 1.0 / _MOST_ZOOM < zoom < _MOST_ZOOM)
         full = self._to_full(np.asarray(matrix, np.float64))
         points = self._scale * (old[near] + 0.5) - 0.5
         return Motion(full, points, self._scale * residual[near], trusted, share)

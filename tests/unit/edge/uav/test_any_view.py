@@ -302,6 +302,20 @@ def test_zoom_and_turn_of_an_oblique_flight_are_measured_among_moving_cars() -> 
         assert np.arctan2(found.matrix[1, 0], found.matrix[0, 0]) == pytest.approx(roll, abs=0.012)
 
 
+@pytest.mark.parametrize("zoom", [2.0, 0.5])
+def test_a_stage_of_the_zoom_within_one_frame_is_measured(zoom: float) -> None:
+    """The flow, which compares windows of one size, found nothing, and the target was looked for at its old size."""
+    world = ObliqueWorld("person", "follow", seed=7, frames=3)
+    wide, _, later = (world.frame(k) for k in range(3))
+    matrix = cv2.getRotationMatrix2D((320.0, 240.0), 0.0, 2.0)
+    near = cv2.warpAffine(later, matrix, world.size)
+    motion = SceneMotion(world.size)
+    for image in (wide, wide, near) if zoom > 1.0 else (near, near, wide):
+        found = motion.update(np.asarray(image, np.uint8), None)
+    assert found.trusted
+    assert found.zoom == pytest.approx(zoom, rel=0.01)
+
+
 @pytest.mark.parametrize("target", ["bicycle", "boat"])
 def test_an_oblique_flight_without_lens_and_telemetry_is_followed(target: str) -> None:
     world = ObliqueWorld(target, "follow", seed=2, frames=45, fps=15.0)

@@ -1,0 +1,68 @@
+"""Black bars beside the picture are no part of the view."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.uav.base import Estimate, Telemetry
+from edge.uav.image_motion.black_bars import picture_area
+from edge.uav.tracker_factory import make_tracker
+from protocols.geometry.camera import Intrinsics
+from protocols.geometry.types import Image
+from tests.support.oblique.world import ObliqueWorld
+
+BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+NED_FROM_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+FRAMES, FPS = 24, 10.0
+
+
+def barred(image: Image, x: int, y: int) -> Image:
+    return np.asarray(cv2.copyMakeBorder(image, y, y, x, x, cv2.BORDER_CONSTANT), np.uint8)
+
+
+def follow(x: int, y: int) -> list[Estimate]:
+    """A flight that leaves its target behind, between bars x and y px wide, with lens and telemetry."""
+    world = ObliqueWorld("car", "away", seed=3, size=(480, 270), fps=FPS, frames=60, away_s=1.0)
+    size = (world.size[0] + 2 * x, world.size[1] + 2 * y)
+    focal = world.truth(0).focal
+    matrix = np.array([[focal, 0.0, (size[0] - 1) / 2], [0.0, focal, (size[1] - 1) / 2], [0.0, 0.0, 1.0]])
+    tracker = make_tracker("ground", size, Intrinsics(*size, matrix), BODY_FROM_CAMERA, FPS)
+    out = []
+    for k, i in enumerate(range(15, 15 + FRAMES)):
+        image, truth = world.rendered(i)
+        attitude = NED_FROM_WORLD @ truth.rotation.T @ BODY_FROM_CAMERA.T
+        tracker.handle_telemetry(Telemetry(k / FPS, attitude, NED_FROM_WORLD @ truth.centre))
+        box = type(truth.box)(truth.box.x + x, truth.box.y + y, truth.box.width, truth.box.height)
+        image = barred(image, x, y)
+        out.append(tracker.begin(image, 0.0, box) if k == 0 else tracker.handle_frame(image, k / FPS))
+    return out
+
+
+def test_bars_beside_the_picture_change_nothing() -> None:
+    """Behind a bar the target was in the image but not to be seen, so that something else was taken for it."""
+    plain = follow(0, 0)
+    assert {e.state.value for e in plain} == {"visible", "coasting"}
+    for x, y in ((0, 40), (56, 0)):
+        for bars, e in zip(follow(x, y), plain, strict=True):
+            assert (bars.state, bars.basis, bars.std) == (e.state, e.basis, pytest.approx(e.std))
+            assert (bars.x - x, bars.y - y) == pytest.approx((e.x, e.y))
+            assert (bars.north, bars.east) == pytest.approx((e.north, e.east), nan_ok=True)
+            for own, other in zip(bars.hypotheses, e.hypotheses, strict=True):
+                assert (own.x - x, own.y - y) == pytest.approx((other.x, other.y))
+            if e.particles is not None and bars.particles is not None:
+                assert bars.particles - [x, y] == pytest.approx(e.particles, nan_ok=True)
+
+
+def test_dark_parts_of_a_picture_are_no_bars() -> None:
+    picture = np.random.default_rng(1).integers(40, 200, (240, 320, 3)).astype(np.uint8)
+    assert picture_area(picture) == (0, 0, 320, 240)
+    letterbox = barred(picture, 0, 30)
+    assert picture_area(letterbox) == (0, 30, 320, 240)
+    cv2.putText(letterbox, "ALT 47 m", (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1)
+    assert picture_area(letterbox) == (0, 30, 320, 240)
+    night = picture.copy()
+    night[:90] = 3  # the sky
+    assert picture_area(night) == (0, 0, 320, 240)
+    assert picture_area(np.zeros_like(night)) == (0, 0, 320, 240)
