@@ -100,7 +100,7 @@ class ObservationStream:
         return message
 
     def _hold(self, message: pb.Observation) -> None:
-        """Keep a frame with people as it is; live of the present clock only, and of no more cameras than are compared."""
+        """Keep a frame with people as it is; live of the present clock only, of no more cameras than are compared."""
         key, live = (message.camera, message.boot_id), self._window_s is not None
         if not any(one.kind == PERSON for one in message.detections):
             return
