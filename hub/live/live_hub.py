@@ -45,6 +45,8 @@ _MIN_PEOPLE_S = 40.0
 _MIN_FILM_S, _COLOURS_FILM_S = 20.0, 40.0
 """Film of two cameras from which on where people stand says where cameras are (in less they meet by chance), and where
 they have colours to tell them by, which take a tenth of the CPU, but longer where few people pass."""
+_FRAME_CPU_S = 0.007
+"""CPU of a frame of unlabelled people: where it is not measured, as in a replay, jobs pause for as long."""
 _FILM_PER_CAMERA_S = 0.1
 """Film [s] that each camera adds to what the first job needs: its share of that job's CPU, 0.08 to 0.13 s."""
 _BEHIND_S = 10.0
@@ -635,7 +637,9 @@ class LiveHub:
             self._take_check(answer)
             return []
         tied, cameras = (len(one.cameras) if one else 0 for one in (self.calibration, job and job.rig))
-        self._schedule.pause(self._submitted_at, answer.cpu_s, calibrated=2 * tied > cameras)
+        by_colour = job is None or (answer.calibration is not None and answer.observations is None)
+        cpu_s = max(answer.cpu_s, 0.0 if by_colour or job is None else _FRAME_CPU_S * len(job.people))
+        self._schedule.pause(self._submitted_at, cpu_s, calibrated=2 * tied > cameras)
         if job is None or answer.number <= self._superseded:
             return []
         self.solver_failure = answer.reason if answer.failed else ""
