@@ -7,6 +7,7 @@ And when the hub gives its next job, how much that searches, and which camera is
 
 from __future__ import annotations
 
+import copyreg
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -45,6 +46,13 @@ _CAMERAS, _FRAMES = 240, 600
 _UNLIKE_OTHERS = 2.5
 """Times the median camera's residuals of people, as angles: of simulated rigs at most 1.2 as calibrated, and 2.3 to 3.2
 where a camera was turned by a degree."""
+
+
+def _observation(data: bytes) -> pb.Observation:
+    return pb.Observation.FromString(data)
+
+
+copyreg.pickle(pb.Observation, lambda one: (_observation, (one.SerializeToString(),)))  # protobuf's classes are not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
