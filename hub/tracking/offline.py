@@ -116,7 +116,9 @@ def follow(
     recorded, state = _tracked(frames, cameras, parameters, lambda share: said(0.5 * share))
     del frames
     smoother = _smoother(recorded, state, parameters)
-    scans = smoother.run(iterations, lambda share: said(0.5 + 0.5 * share)) if smoother is not None else []
+    scans: list[SmoothedScan] = []
+    if smoother is not None:
+        scans = smoother.run(iterations=iterations, progress=lambda share: said(0.5 + 0.5 * share))
     tracks = _sampled(smoother, scans, np.asarray(times_ns, dtype=np.int64), up) if smoother is not None else ()
     summaries = _summaries(smoother, state, cameras)
     return FollowResult(tracks, summaries, (*warnings, *_unused(summaries)), up)
