@@ -212,7 +212,9 @@ def _by_place(job: SolverJob) -> Update:
     except Refused as refusal:  # that nobody is seen by two cameras contradicts no camera
         raise Refused(refusal.reason) from refusal
     update = _by_labels(replace(job, observations=followed.observations))
-    return replace(update, observations=followed.observations)
+    found = update.calibration
+    found = replace(found, refused={name: followed.refused.get(name, why) for name, why in found.refused.items()})
+    return replace(update, calibration=found, observations=followed.observations)
 
 
 def _at_its_lags(
