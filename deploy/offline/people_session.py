@@ -14,8 +14,7 @@ from deploy.offline.follow.objects import (
     without_clock_steps,
 )
 from hub.api import RecordedSession
-from hub.calibration.people import MIN_INTERVAL_NS
-from hub.tracking.calibration.people import SEVERAL_SHARE
+from hub.tracking.calibration.people import MIN_INTERVAL_NS, SEVERAL_SHARE
 from protocols.core.errors import Refused
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.csv_table import read_csv_header, read_csv_table

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -63,10 +63,14 @@ _BETTER_KNOWN = 0.7  # a clock step is refined where its std falls below this sh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Update:
-    """An answer, and cameras that were moved: by name, camera time [s] from which on the new pose holds."""
+    """An answer, and cameras that were moved: by name, camera time [s] from which on the new pose holds.
+
+    observations: of unlabelled people who were followed for it, in place of those that were given.
+    """
 
     calibration: Calibration
-    moved: dict[str, float]
+    moved: dict[str, float] = field(default_factory=dict)
+    observations: Observations | None = None
 
 
 def update_calibration(

@@ -16,7 +16,7 @@ from google.protobuf.message import Message
 from hub.clocks.change_detector import ClockChange
 from hub.clocks.external_prior import ArrivalPriors, ExternalClockPrior, ExternalClockPriors
 from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments, RateChanges
-from hub.tracking.calibration.people import PERSON, SEVERAL_SHARE, PeopleTracklets
+from hub.tracking.calibration.people import MIN_INTERVAL_NS, PERSON, SEVERAL_SHARE, PeopleTracklets
 from hub.tracking.detections import tracked_kind
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
@@ -28,8 +28,12 @@ from protocols.session.rig import Rig
 
 LEAST_ROWS = 90
 """Detections of a marker that two cameras need to be calibrated by them: three seconds at 30 Hz."""
+AMBIGUOUS_COLOURS = "the colours of the people are ambiguous, or no two cameras observed the same person"
 _PEOPLE_WINDOW_S = 600.0
 """Of a recorded log: labels by colour of more tracklets take a minute and more."""
+_LIVE_PEOPLE_S, _LIVE_CAMERAS = 60.0, 24
+"""Of unlabelled people, who are followed anew in every job: 60 s of five people in five cameras take 25 s of CPU. And
+the cameras of which they are held, 1 to 2 MB each: each is compared with each, in 0.4 to 1.2 s."""
 
 
 class ObservationStream:
@@ -51,11 +55,13 @@ class ObservationStream:
         """Forget the observations; what is known of the clocks is kept."""
         self.marker = SessionBuilder(self._window_s)
         self.people = PeopleTracklets(_PEOPLE_WINDOW_S if self._window_s is None else self._window_s)
+        self._held: dict[tuple[str, str], deque[pb.Observation]] = {}
 
     def release(self, camera: str) -> None:
         """Forget a camera; what is known of its clock is kept."""
         self.marker.forget(camera)
         self.people.forget(camera)
+        self._held = {key: held for key, held in self._held.items() if key[0] != camera}
         self._infos.pop(camera, None)
 
     def assign(
@@ -86,11 +92,35 @@ class ObservationStream:
         if isinstance(message, pb.Observation) and any(map(tracked_kind, message.detections)):
             if admits_people is None or admits_people(message):
                 self.people.handle(message)
+                self._hold(message)
             message = without_tracked(message)
         self.marker.handle(message, now)
         if isinstance(message, pb.Observation) and self._rate_changes.cameras:
             self._extend_old_segment(message, now)
         return message
+
+    def _hold(self, message: pb.Observation) -> None:
+        """Keep a frame with people as it is; live of the present clock only, of no more cameras than are compared."""
+        key, live = (message.camera, message.boot_id), self._window_s is not None
+        if not any(one.kind == PERSON for one in message.detections):
+            return
+        if live and key not in self._held:
+            self._held = {other: held for other, held in self._held.items() if other[0] != message.camera}
+            if len(self._held) >= _LIVE_CAMERAS:
+                return
+        mine, now = self._held.setdefault(key, deque()), message.device_time_ns
+        if mine and now - mine[-1].device_time_ns < MIN_INTERVAL_NS:
+            return
+        mine.append(message)
+        window_s = min(_LIVE_PEOPLE_S, self._window_s) if self._window_s is not None else _PEOPLE_WINDOW_S
+        while mine[0].device_time_ns < now - window_s * NANOSECONDS:
+            mine.popleft()
+
+    def several_people(self) -> dict[str, tuple[pb.Observation, ...]]:
+        """The frames with people by camera, of the boot id with most; empty where no two people are seen at once."""
+        longest = dict(sorted(self._held, key=lambda key: len(self._held[key])))
+        held = {name: tuple(self._held[name, boot]) for name, boot in longest.items()}
+        return held if are_several([*itertools.chain(*held.values())]) else {}
 
     def has_info(self, camera: str) -> bool:
         """Whether a camera has introduced itself: without its image size it is not calibrated."""
@@ -119,7 +149,7 @@ class ObservationStream:
         rig = Rig(cameras, metadata={"target": PERSON})
         observations = self.people.observations()
         if refusing and not len(observations):
-            raise Refused("the colours of the people are ambiguous, or no two cameras observed the same person")
+            raise Refused(AMBIGUOUS_COLOURS)
         return rig, observations
 
     def _extend_old_segment(self, message: pb.Observation, now: float) -> None:
@@ -166,28 +196,22 @@ def session_from_messages(messages: Iterable[Message]) -> RecordedStream:
     Times of arrival are not used: a log of other makers holds whatever they wrote. Raises Refused where there is
     nothing to calibrate from, and InputError for rows that are no pixels of their images.
     """
-    stream, held = ObservationStream(), dict[tuple[str, str], deque[pb.Observation]]()
+    stream = ObservationStream()
     for message in messages:
         if isinstance(message, pb.AgentStatus):
             stream.clock_priors.handle(message)
             continue
         if isinstance(message, pb.Observation):
             message, _ = stream.assign(message, None)
-            if any(one.kind == PERSON for one in message.detections):
-                mine = held.setdefault((message.camera, message.boot_id), deque())
-                mine.append(message)
-                while mine[0].device_time_ns < message.device_time_ns - _PEOPLE_WINDOW_S * NANOSECONDS:
-                    mine.popleft()
         stream.store(message)
     of_marker = stream.has_marker(LEAST_ROWS)
-    longest = dict(sorted(held, key=lambda key: len(held[key])))  # by camera, the boot id with most frames
-    people = () if of_marker else tuple(itertools.chain(*(held[key] for key in longest.items())))
-    people = people if are_several(people) else ()
+    by_camera = {} if of_marker else stream.several_people()
+    people = tuple(itertools.chain(*by_camera.values()))
     rig, observations = stream.build(of_marker, refusing=not people)
     source = stream.marker if of_marker else stream.people
     boots = {name: source.boot(name) for name in rig.cameras}
     if people:  # those associated by colour are of the last boot ids: a prior has to be of both
-        boots = {name: boot for name, boot in boots.items() if longest.get(name) == boot}
+        boots = {name: boots[name] for name, held in by_camera.items() if held[0].boot_id == boots.get(name)}
     alarms = tuple(
         f"{text}: its rows on one side of that were left out"
         for text in stream.clocks.alarms.values()

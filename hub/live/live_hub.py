@@ -6,6 +6,7 @@ No sockets, threads, files or wall clock: ``handle`` takes messages, ``tick(now)
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from google.protobuf.message import Message
 from hub.bundle.problem import LARGE_NETWORK
 from hub.calibration.coverage import CoverageMonitor
 from hub.calibration.resection.unconnected import listed
-from hub.clocks.observation_stream import LEAST_ROWS, ObservationStream
+from hub.clocks.observation_stream import AMBIGUOUS_COLOURS, LEAST_ROWS, ObservationStream
 from hub.distributed.network.host import NodeHost
 from hub.distributed.solver import node_calibration
 from hub.live.budgets import CameraBudgets
@@ -27,6 +28,7 @@ from hub.live.reloaded import VERIFY_ROWS, ReloadedCalibration
 from hub.live.solver import InlineSolver, JobSchedule, Solver, SolverAnswer, SolverJob
 from hub.tracking.calibration.people import PeopleTracklets
 from hub.tracking.live_tracking import LiveTracking
+from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
@@ -40,6 +42,11 @@ HubState = Literal["collecting", "searching", "calibrated", "degraded", "refused
 
 _MIN_PEOPLE_S = 40.0
 """Total duration of people's tracklets [s] that two cameras need before people-based calibration is tried."""
+_MIN_FILM_S, _COLOURS_FILM_S = 20.0, 40.0
+"""Film of two cameras from which on where people stand says where cameras are (in less they meet by chance), and where
+they have colours to tell them by, which take a tenth of the CPU, but longer where few people pass."""
+_FRAME_CPU_S = 0.007
+"""CPU of a frame of unlabelled people: where it is not measured, as in a replay, jobs pause for as long."""
 _FILM_PER_CAMERA_S = 0.1
 """Film [s] that each camera adds to what the first job needs: its share of that job's CPU, 0.08 to 0.13 s."""
 _BEHIND_S = 10.0
@@ -131,6 +138,8 @@ class LiveHub:
         self._submitted_at = 0.0
         self._submitted_boots: dict[str, str] = {}
         self._answer_rows = 0.0
+        self._by_place, self._followed = False, tuple[pb.Observation, ...]()
+        """Whether the present answer is by where unlabelled people stand, and their frames in the last job."""
         self.calibration: Calibration | None = None
         self.session: tuple[Rig, Observations] | None = None
         self.refusal: Refused | None = None
@@ -431,7 +440,8 @@ class LiveHub:
             out += list(self._other_sizes().values())[:8]
         if self._known_faults:
             out.append(f"the given calibration: {'; '.join(self._known_faults[:4])}")
-        if self.solver.busy and now - self._submitted_at > _BEHIND_S:
+        load = 1.0 if self._submitted is None else self._submitted.load
+        if self.solver.busy and now - self._submitted_at > load * _BEHIND_S:
             out.append(f"the solver is behind: {now - self._submitted_at:.0f} s for one job")
         return out + [text for text in (self.solver_failure, self.notice) if text]
 
@@ -496,8 +506,10 @@ class LiveHub:
     def _submit(self, now: float, final: bool) -> list[Message]:
         """Hand the present observations to the solver; a final job searches for every camera that is not tied."""
         try:
-            heard, observations = self._build_session()
-            rig, observations = self._without_other_pixels(heard, observations)
+            heard, observations, people = self._build_session()
+            if people and people == self._followed and not final:
+                return []  # nobody was in view since
+            rig, observations = self._without_other_pixels(heard, observations, people)
         except Refused as refusal:
             self.refusal = refusal
             return []
@@ -508,6 +520,7 @@ class LiveHub:
         left_out = self._schedule.left_out
         if left_out in rig.cameras and len(rig.cameras) > 2:
             rig, observations = without_camera(rig, observations, left_out)
+        self._followed, people = people, tuple(one for one in people if one.camera in rig.cameras)
         source = self._source()
         boots = {name: source.boot(name) for name in rig.cameras}
         last = self._start_from(boots)
@@ -517,8 +530,8 @@ class LiveHub:
             now,
             final=final,
             first=last is None,
-            untied=last is None or any(name not in last.cameras for name in observations.cameras),
-            rows=len(observations),
+            untied=last is None or not last.cameras.keys() >= {*observations.cameras, *(one.camera for one in people)},
+            rows=max(len(observations), len(people)),
             has_arrivals=bool(arrivals),
         )
         if not self.unverified:
@@ -541,6 +554,8 @@ class LiveHub:
             self.stream.clock_priors.for_boots(boots),
             arrivals,
             self.settings.refine_lenses,
+            people,
+            self._by_place,
         )
         ranges = [one for one in self.stream.marker.ranges() if one[0] in rig.cameras] if self._has_marker() else []
         return self._hand_over(job, boots, ranges, now)
@@ -561,7 +576,7 @@ class LiveHub:
             return
         self._next_check = now + _CHECK_EVERY_S
         try:
-            rig, observations = self._build_session()
+            rig, observations, people = self._build_session()
         except Refused:
             return
         except Exception as error:  # noqa: BLE001 - whatever is wrong with the rows must not stop the hub
@@ -573,7 +588,8 @@ class LiveHub:
         observations = replace(observations, tracks=tracks)
         self._jobs += 1
         rig = replace(self._rig, metadata=rig.metadata)
-        job = SolverJob(self._jobs, rig, observations, self.calibration, verify=True)
+        people = tuple(one for one in people if one.camera in self.calibration.cameras)
+        job = SolverJob(self._jobs, rig, observations, self.calibration, verify=True, people=people)
         self._submitted, self._submitted_at, self._submitted_boots = job, now, {}
         self.solver.submit(job, now)
 
@@ -621,7 +637,9 @@ class LiveHub:
             self._take_check(answer)
             return []
         tied, cameras = (len(one.cameras) if one else 0 for one in (self.calibration, job and job.rig))
-        self._schedule.pause(self._submitted_at, answer.cpu_s, calibrated=2 * tied > cameras)
+        by_colour = job is None or (answer.calibration is not None and answer.observations is None)
+        cpu_s = max(answer.cpu_s, 0.0 if by_colour or job is None else _FRAME_CPU_S * len(job.people))
+        self._schedule.pause(self._submitted_at, cpu_s, calibrated=2 * tied > cameras)
         if job is None or answer.number <= self._superseded:
             return []
         self.solver_failure = answer.reason if answer.failed else ""
@@ -652,7 +670,8 @@ class LiveHub:
         for name, since in answer.moved.items():
             self.counters["moved"] += 1
             self.stream.marker.forget_before(name, since)
-        rows = len(job.observations)
+        observations = job.observations if answer.observations is None else answer.observations
+        rows = len(observations)
         # As many rows may have larger stds, once the noise is known better: only fewer must not replace more.
         fewer = rows < self._answer_rows and not job.verify and self.calibration is not None
         if fewer and not self._says_more(found, answer.moved):
@@ -662,9 +681,9 @@ class LiveHub:
         then = self._keep_restarted(job, found)
         self._reloaded = None
         self._answer_rows = np.inf if job.verify else rows  # of a reloaded answer the rows are not known
-        self.session = job.rig, job.observations
+        self._by_place, self.session = answer.observations is not None, (job.rig, observations)
         self._rig_cameras |= job.rig.cameras
-        if unseen := found.cameras.keys() - set(job.observations.cameras):
+        if unseen := found.cameras.keys() - set(observations.cameras):
             found = replace(found, warnings=(*found.warnings, f"{listed(sorted(unseen))}: {_UNSEEN}"))
         if job.last is None and self.calibration is not None and self.tracking is not None and not self.is_shard:
             self.tracking = LiveTracking()  # in another world frame
@@ -728,7 +747,7 @@ class LiveHub:
         """The pose nodes' calibration, where this hub does not solve."""
         self._revision += 1
         try:
-            rig, observations = self._build_session()
+            rig, observations, _ = self._build_session()
             self.session = rig, observations
             self.calibration = node_calibration(rig, self.nodes)
         except Refused as refusal:
@@ -764,12 +783,25 @@ class LiveHub:
         clocks = {name: one.time_map for name, one in calibration.cameras.items()}
         return sum(held >= _MIN_PEOPLE_S for held in self.stream.people.shared_seconds(clocks).values()) >= 2
 
-    def _build_session(self) -> tuple[Rig, Observations]:
-        """The rig and the observations: of the marker or, if there is none, of people."""
-        rig, observations = self.stream.build(self._has_marker() or not self.settings.solve)
-        return merge_rigs(rig, self._rig), observations
+    def _build_session(self) -> tuple[Rig, Observations, tuple[pb.Observation, ...]]:
+        """The rig and the observations: of the marker or, if there is none, of people, whose colours may tell nobody.
 
-    def _without_other_pixels(self, rig: Rig, observations: Observations) -> tuple[Rig, Observations]:
+        And the frames of several unlabelled people, as soon as two cameras have filmed them for long enough.
+        """
+        of_marker = self._has_marker() or not self.settings.solve
+        held = {} if of_marker else self.stream.several_people()
+        rig, observations = self.stream.build(of_marker, refusing=False)
+        spans = [(one[-1].device_time_ns - one[0].device_time_ns) / NANOSECONDS for one in held.values()]
+        least = _COLOURS_FILM_S if len(observations) else _MIN_FILM_S
+        people = tuple(itertools.chain(*held.values())) if sum(span >= least for span in spans) >= 2 else ()
+        if not of_marker and not people and not len(observations):
+            later = f"; where they stand is compared after {least:.0f} s" if held else ""
+            raise Refused(f"{AMBIGUOUS_COLOURS}{later}")
+        return merge_rigs(rig, self._rig), observations, people
+
+    def _without_other_pixels(
+        self, rig: Rig, observations: Observations, people: Collection[pb.Observation] = ()
+    ) -> tuple[Rig, Observations]:
         """The session without the cameras whose rows are no pixels of their images. Raises Refused without two others.
 
         Their rows would make the answer wrong, or the camera be waited for without end.
@@ -778,7 +810,7 @@ class LiveHub:
         faults = self._pixel_faults = {name: why for name, why in faults.items() if name in rig.cameras}
         for name in faults:
             rig, observations = without_camera(rig, observations, name)
-        if faults and len(observations.cameras) < 2:
+        if faults and len({*observations.cameras, *(one.camera for one in people)} - faults.keys()) < 2:
             raise Refused("fewer than two cameras have pixels of their images", dict(faults))
         if small := small_pictures(rig, observations):
             self._pixel_faults = {**faults, "": small}

@@ -45,6 +45,9 @@ class ScheduledHub(LiveHub):
         for event in events:
             if event.kind == "submitted" and event.rows:
                 out += self._submit_recorded(event, now)
+            elif event.kind == "submitted":  # by people, as they are known now
+                self.solver.poll(now)
+                out += self._submit(now, final=False)
             elif event.kind == "applied" and self._submitted is not None:
                 answer = self.solver.poll(now)
                 out += [] if answer is None else self._take(answer, now)

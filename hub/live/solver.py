@@ -7,18 +7,24 @@ And when the hub gives its next job, how much that searches, and which camera is
 
 from __future__ import annotations
 
+import copyreg
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
-from hub.calibration.incremental import update_calibration
+from hub.calibration.incremental import Update, update_calibration
+from hub.calibration.people.ways import first_complete
 from hub.calibration.pipeline import heads_of_people
 from hub.calibration.triangulation import triangulate
 from hub.clocks.external_prior import ExternalClockPrior
+from hub.clocks.observation_stream import AMBIGUOUS_COLOURS
+from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.errors import InputError, Refused
+from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
@@ -35,9 +41,18 @@ _FIRST_FULL_S = 60.0
 arrival it finds nothing more."""
 _LEFT_OUT_S = 60.0
 """How long a camera is left out without which the solver does not fail."""
+_CAMERAS, _FRAMES = 240, 600
+"""Of a job that is not large. Of people who are followed a frame costs 0.01 s of CPU, of a crowd of 25 0.05."""
 _UNLIKE_OTHERS = 2.5
 """Times the median camera's residuals of people, as angles: of simulated rigs at most 1.2 as calibrated, and 2.3 to 3.2
 where a camera was turned by a degree."""
+
+
+def _observation(data: bytes) -> pb.Observation:
+    return pb.Observation.FromString(data)
+
+
+copyreg.pickle(pb.Observation, lambda one: (_observation, (one.SerializeToString(),)))  # protobuf's classes are not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +61,8 @@ class SolverJob:
 
     last: the answer to start from, with the cameras whose clock and pose hold; None = from scratch. search, full: of
     cameras that are not tied, and refine_lenses: see `update_calibration`. verify: only test whether the
-    rows agree with ``last``.
+    rows agree with ``last``. people: frames of several unlabelled people; the observations are then of those associated
+    by colour. by_place: ``last`` is by where people stand: colours are not tried.
     """
 
     number: int
@@ -59,6 +75,13 @@ class SolverJob:
     clock_priors: Mapping[str, ExternalClockPrior] = field(default_factory=dict)
     arrivals: Mapping[str, ExternalClockPrior] = field(default_factory=dict)
     refine_lenses: bool = False
+    people: tuple[pb.Observation, ...] = ()
+    by_place: bool = False
+
+    @property
+    def load(self) -> float:
+        """Times what a job may cost that is not large."""
+        return max(1.0, len(self.rig.cameras) / _CAMERAS, len(self.people) / _FRAMES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +90,7 @@ class SolverAnswer:
 
     refused: reasons by camera. permanent: more of the same observations cannot help. failed: the solver did not finish
     (an error, its budget, or its process ended). moved: cameras that were moved, and camera times [s] since when.
+    observations: of the people who were followed, where it is by where they stand.
     """
 
     number: int
@@ -76,6 +100,7 @@ class SolverAnswer:
     permanent: bool = False
     failed: bool = False
     moved: Mapping[str, float] = field(default_factory=dict)
+    observations: Observations | None = None
     cpu_s: float = 0.0
 
 
@@ -124,18 +149,8 @@ def run_job(job: SolverJob, cpu_clock: Callable[[], float] = time.process_time) 
     """The answer to a job. No error escapes: a camera's strange rows must not end the hub."""
     began = cpu_clock()
     try:
-        if job.verify:
-            return SolverAnswer(job.number, _verified(job), cpu_s=cpu_clock() - began)
-        update = update_calibration(
-            job.rig,
-            job.observations,
-            job.last,
-            search=job.search,
-            full=job.full,
-            clock_priors=job.clock_priors,
-            arrivals=job.arrivals,
-            refine_lenses=job.refine_lenses,
-        )
+        # To begin, whom colours place is enough; the others follow.
+        update = first_complete(_ways(job), {one.camera for one in job.people} if job.last else ())
     except Refused as refusal:
         return SolverAnswer(
             job.number,
@@ -149,7 +164,77 @@ def run_job(job: SolverJob, cpu_clock: Callable[[], float] = time.process_time) 
     except (ValueError, ArithmeticError, IndexError, KeyError, np.linalg.LinAlgError, MemoryError) as error:
         reason = f"the solver failed: {type(error).__name__}: {error}"
         return SolverAnswer(job.number, reason=reason, failed=True, cpu_s=cpu_clock() - began)
-    return SolverAnswer(job.number, update.calibration, moved=update.moved, cpu_s=cpu_clock() - began)
+    return SolverAnswer(
+        job.number, update.calibration, moved=update.moved, observations=update.observations, cpu_s=cpu_clock() - began
+    )
+
+
+def _ways(job: SolverJob) -> list[Callable[[], Update]]:
+    """How a job's answer is looked for, in this order.
+
+    An answer by colours goes on so; those whom these leave out are looked for by place with the searches over all lags.
+    """
+    ways: list[Callable[[], Update]] = [] if job.by_place else [partial(_by_labels, job)]
+    if job.people and (job.by_place or job.last is None or job.full or job.verify):
+        ways.append(partial(_by_place, job))
+    return ways
+
+
+def _by_labels(job: SolverJob) -> Update:
+    """The answer by the job's observations."""
+    if job.people and not len(job.observations):
+        raise Refused(AMBIGUOUS_COLOURS)
+    if job.verify:
+        return Update(_verified(job))
+    return update_calibration(
+        job.rig,
+        job.observations,
+        job.last,
+        search=job.search,
+        full=job.full,
+        clock_priors=job.clock_priors,
+        arrivals=job.arrivals,
+        refine_lenses=job.refine_lenses,
+    )
+
+
+def _by_place(job: SolverJob) -> Update:
+    """The answer by where people stand; from the last one on those are followed who meet at its lags."""
+    from hub.calibration.people.unlabelled import calibrate_people, follow_people
+
+    common = {**({} if job.full and job.last is None else job.arrivals), **job.clock_priors}
+    if job.last is None:
+        found, observations = calibrate_people(job.rig, job.people, priors=common)
+        return Update(found, observations=observations)
+    people = [one for one in job.people if job.search or one.camera in job.last.cameras]
+    try:
+        followed = follow_people(job.rig, people, priors=_at_its_lags(job.last, people, common))
+    except Refused as refusal:  # that nobody is seen by two cameras contradicts no camera
+        raise Refused(refusal.reason) from refusal
+    update = _by_labels(replace(job, observations=followed.observations))
+    found = update.calibration
+    found = replace(found, refused={name: followed.refused.get(name, why) for name, why in found.refused.items()})
+    return replace(update, calibration=found, observations=followed.observations)
+
+
+def _at_its_lags(
+    last: Calibration, people: Sequence[pb.Observation], common: Mapping[str, ExternalClockPrior]
+) -> dict[str, ExternalClockPrior]:
+    """Priors of all clocks on the reference clock of an answer: its own lags, and others' by a common clock."""
+    newest = {one.camera: CameraTime(one.device_time_ns / NANOSECONDS) for one in people}
+    lags = {
+        name: float(one.time_map.reference_from_camera(newest[name])) - newest[name]
+        for name, one in last.cameras.items()
+        if name in newest
+    }
+    shifts = [common[name].unix_minus_camera - lag for name, lag in lags.items() if name in common]
+    shift = float(np.median(shifts)) if shifts else 0.0
+    others = {
+        name: replace(one, unix_minus_camera=one.unix_minus_camera - shift, error_bound=2.0 * one.error_bound)
+        for name, one in common.items()
+        if shifts and name not in lags
+    }
+    return {name: ExternalClockPrior("", lag, 0.0) for name, lag in lags.items()} | others
 
 
 def _verified(job: SolverJob) -> Calibration:

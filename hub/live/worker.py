@@ -13,8 +13,8 @@ from contextlib import suppress
 
 from hub.live.solver import SolverAnswer, SolverJob, run_job
 
-_BUDGET_S, _CAMERAS = 60.0, 240
-"""CPU [s] for one job of so many cameras, and of more for each as much: twice what those of a street take."""
+_BUDGET_S = 60.0
+"""CPU [s] for one job that is not large, and of more as its load says: twice what those of a street take."""
 _IDLE_SHARE = 0.01  # of a core: one that computes had 0.13 beside twenty cameras on two cores, one that hangs has none
 _MEMORY_BYTES = 3 << 30  # of the solver's process
 _NICENESS = 5  # below the hub's own
@@ -50,7 +50,7 @@ class WorkerSolver:
             self._end()
             future = self._started().submit(run_job, job)
         self._job = job.number, now, future
-        self._share = max(1.0, len(job.rig.cameras) / _CAMERAS)
+        self._share = job.load
         self._looked, self._spent_s = now, self._cpu_s()
         self._spent_before_s = self._spent_s
 

@@ -17,7 +17,7 @@ from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import MultiTargetState, Targets
 from hub.tracking.frame_update import jointly, process_frame
 from hub.tracking.parameters import TrackerParameters
-from hub.tracking.smoothing import LOG_ABSENT, BatchSmoother, RecordedScan, SmoothedScan
+from hub.tracking.smoothing import ITERATIONS, LOG_ABSENT, BatchSmoother, RecordedScan, SmoothedScan
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import Refused
 from protocols.geometry.types import Bools, Floats, Ints
@@ -83,13 +83,15 @@ def follow(
     times_ns: Sequence[int],
     *,
     up: Floats | None = None,
+    iterations: int = ITERATIONS,
     progress: Callable[[float], None] | None = None,
 ) -> FollowResult:
     """The tracks of a recording: forward by the live tracker, then smoothed and linked over the whole.
 
     observations: in any order; their times are on each camera's clock. times_ns: reference times at which positions
-    are wanted. up: (3,) unit vector in the world frame; None: estimated from upright people. progress: gets the done
-    share. Raises Refused if nobody can be followed.
+    are wanted. up: (3,) unit vector in the world frame; None: estimated from upright people. iterations: of association
+    and linking over the whole; with none, tracks are the live tracker's. progress: gets the done share. Raises Refused
+    if nobody can be followed.
     """
     cameras = {name: TrackingCamera.from_calibration(camera) for name, camera in calibration.cameras.items()}
     frames = sorted(
@@ -114,7 +116,9 @@ def follow(
     recorded, state = _tracked(frames, cameras, parameters, lambda share: said(0.5 * share))
     del frames
     smoother = _smoother(recorded, state, parameters)
-    scans = smoother.run(progress=lambda share: said(0.5 + 0.5 * share)) if smoother is not None else []
+    scans: list[SmoothedScan] = []
+    if smoother is not None:
+        scans = smoother.run(iterations=iterations, progress=lambda share: said(0.5 + 0.5 * share))
     tracks = _sampled(smoother, scans, np.asarray(times_ns, dtype=np.int64), up) if smoother is not None else ()
     summaries = _summaries(smoother, state, cameras)
     return FollowResult(tracks, summaries, (*warnings, *_unused(summaries)), up)

@@ -7,14 +7,17 @@ from pathlib import Path
 import pytest
 
 from deploy.logs.replay_hub import replay_through_hub
+from edge.scenes import get_people_scene
 from hub.live.live_hub import LiveHub, LiveSettings
-from hub.live.solver import InlineSolver, SolverAnswer
+from hub.live.scheduled_hub import ScheduledHub
+from hub.live.solver import InlineSolver, SolverAnswer, SolverJob
 from protocols.core.clocks import NANOSECONDS
 from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CALIBRATION, CAMERA_INFO, OBSERVATION, PREDICTION, SOLVER_EVENT, TRACK
 from tests.integration.live.test_live_hub import messages
+from tests.support.people_traffic import film
 from tests.support.rigs import simulate
 
 TOPICS = {topic.message: topic for topic in (CALIBRATION, TRACK, PREDICTION, SOLVER_EVENT, OBSERVATION, CAMERA_INFO)}
@@ -92,3 +95,20 @@ def test_a_second_replay_gives_equal_bytes(live: Path, again: Path, tmp_path: Pa
     replay_through_hub(live, tmp_path / "second.mcap")
     assert (tmp_path / "second.mcap").read_bytes() == again.read_bytes()
     assert TRACK in {logged.topic for logged in LogReader(again).messages()}
+
+
+def test_a_job_by_people_is_repeated() -> None:
+    """Its event names no rows: the replay left it out, and tracked nobody."""
+    hub, traffic = ScheduledHub(), film(get_people_scene(21, 4, 3), 36.0, 21)
+    jobs: list[SolverJob] = []
+    hub.solver.submit = lambda job, now: jobs.append(job)  # type: ignore[method-assign]
+    for info in traffic.infos:
+        hub.handle(info)
+    for message in traffic.messages():
+        for one in message.detections:
+            one.ClearField("colour")
+        hub.handle(message)
+    hub.handle(pb.SolverEvent(schema_version=1, job=1, kind="submitted"))
+    hub.tick(36.0)
+    assert [len(job.people) > 1000 for job in jobs] == [True]
+    assert jobs[0].load > 1.0

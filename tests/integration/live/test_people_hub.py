@@ -14,6 +14,7 @@ from deploy.cli import run
 from deploy.demo.people import score_log
 from deploy.simulation.session import camera_tables
 from edge import scenes
+from edge.scenes.people.scene import PeopleScene
 from hub.live.agent import run_hub, status_message
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings, merge_rigs
 from hub.live.solver import SolverJob, _unlike_others
@@ -284,3 +285,53 @@ def test_people_of_whom_no_row_is_left_are_refused(traffic: Traffic, monkeypatch
     monkeypatch.setattr("hub.tracking.calibration.people._matches_colour", lambda *_: False)
     with pytest.raises(Refused, match="colours of the people are ambiguous"):
         hub.stream.build(of_marker=False)
+
+
+def without_colours(scene: PeopleScene, seconds: float, seed: int) -> Traffic:
+    traffic = film(scene, seconds, seed)
+    for message in traffic.messages():
+        for one in message.detections:
+            one.ClearField("colour")
+    return traffic
+
+
+def test_unlabelled_people_calibrate_the_hub_and_are_tracked() -> None:
+    """By a log of the same messages `calibrate` answered; the hub waited for colours that were not there.
+
+    A camera that joins later is found, and a hub that is restarted verifies the answer in the same way.
+    """
+    scene = scenes.get_people_scene(9341, 4, 5)
+    traffic, hub, tracks = without_colours(scene, 72.0, 9341), LiveHub(), list[pb.Track]()
+    for info in traffic.infos:
+        hub.handle(info)
+    reasons, joins, due = set(), 36.0, 0.0
+    for at, message in traffic.arrivals:
+        if message.camera == "cam3" and at < joins:
+            continue
+        hub.handle(message, 1e9 + at)
+        if at >= due:  # each job takes seconds of the test
+            reasons.add(hub.state(at)[1].partition(" (")[0])
+            tracks += [one for one in hub.tick(at) if isinstance(one, pb.Track)]
+            due = at + (16.0 if hub.calibration is not None else 8.0)
+        elif hub.tracking is not None:
+            tracks += [one for one in hub.tracking.tick(at) if isinstance(one, pb.Track)]
+        if hub.calibration is not None and len(hub.calibration.cameras) == 4:
+            break
+    assert "people observed too briefly yet" in reasons
+    found = hub.calibration
+    assert found is not None, hub.refusal
+    assert set(found.cameras) == {camera.name for camera in scene.cameras}, found.refused
+    assert len({one.label for one in tracks if one.state == "confirmed"}) >= 4
+    for name, camera in found.cameras.items():
+        true = scene.true_time_map(name, found.reference)
+        error = camera.lag - (true.clock_rate - 1.0) * camera.lag_time - true.time_offset
+        assert abs(error) <= 3.0 * camera.lag_std <= 0.03
+    again = LiveHub()
+    again.reload(found, hub.boot_ids, hub.delays)
+    for info in traffic.infos:
+        again.handle(info)
+    for at, message in traffic.arrivals:
+        again.handle(message, 1e9 + at)
+    for now in (80.0, 81.0, 82.0):
+        again.tick(now)
+    assert again.counters["verified"], again.state(82.0)

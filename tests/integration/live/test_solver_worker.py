@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from hub.live import worker
 from hub.live.live_hub import LiveHub, LiveSettings
 from hub.live.solver import SolverAnswer, SolverJob, run_job
 from hub.live.worker import WorkerSolver
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.observations import Observations
 from tests.integration.live.test_live_hub import messages
 from tests.support.rigs import Session, simulate
 
@@ -28,7 +31,7 @@ def job(session: Session) -> SolverJob:
     hub = LiveHub(LiveSettings(interval_s=1e9))
     for message in messages(session):
         hub.handle(message)
-    rig, observations = hub._build_session()
+    rig, observations, _ = hub._build_session()
     return SolverJob(1, rig, observations, None)
 
 
@@ -47,6 +50,15 @@ def answer_of(solver: WorkerSolver, budget_s: float = 60.0) -> SolverAnswer:
             return answer
         time.sleep(0.02)
     raise AssertionError("no answer")
+
+
+def test_unlabelled_people_reach_the_worker(job: SolverJob, solver: WorkerSolver) -> None:
+    """Protobuf's messages cannot be pickled: each job failed, and one camera after the other was left out."""
+    people = (pb.Observation(schema_version=1, camera=next(iter(job.rig.cameras)), detections=[pb.Detection(u=1.0)]),)
+    solver.submit(replace(job, observations=Observations({}), people=people), time.monotonic())
+    answer = answer_of(solver)
+    assert not answer.failed, answer.reason
+    assert answer.reason.startswith("by colour: the colours of the people are ambiguous")
 
 
 def hang(job: SolverJob) -> SolverAnswer:
