@@ -108,7 +108,7 @@ def simulated(
         given[name] = CameraCalibration(name, lens, wrong, TimeMap(1.0, -clock), 1e-3, np.zeros(3), 1.0)
         for number in range(frames):
             moment = number / fps + delay
-            feet = np.column_stack([paths[round(moment * STEPS_HZ)], np.zeros(people)])
+            feet = np.column_stack([_places(paths, moment), np.zeros(people)])
             message = pb.Observation(
                 schema_version=1, camera=name, boot_id="b", sequence=number, frame=number,
                 device_time_ns=round((moment + clock) * NANOSECONDS),
@@ -122,6 +122,12 @@ def simulated(
     truth = GroundTruth(number / fps, person, place)
     calibration = Calibration(cameras=given, reference="cam0", scale="metric", units="m", solver="given", version="")
     return Hall(messages, calibration, truth, [number / fps for number in range(frames)])
+
+
+def _places(paths: Floats, moment: float) -> Floats:
+    """Places (n, 2) at a moment [s]. Rounded to a step, a camera's clock would seem to be up to 8 ms off."""
+    step, share = divmod(moment * STEPS_HZ, 1.0)
+    return np.asarray(paths[int(step)] * (1.0 - share) + paths[int(step) + 1] * share)
 
 
 def _detect(
