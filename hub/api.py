@@ -218,7 +218,8 @@ def calibrate(
     began = time.process_time()
     try:
         best = first_complete(
-            [partial(way, session, options, progress) for way in ways], {message.camera for message in session.people}
+            [partial(way, session, options, progress) for way in ways],
+            {message.camera for message in session.people} & session.rig.cameras.keys(),
         )
     except Refused as refused:
         refused.cpu_seconds = time.process_time() - began

@@ -6,6 +6,7 @@ import csv
 import io
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from math import hypot
 
 from edge.offline.detections import HEADER
 from hub.tracking.calibration.people import END_STD, SEVERAL_SHARE
@@ -29,18 +30,16 @@ def rows_of_one_target(rows: Sequence[str]) -> tuple[tuple[str, ...], int, int]:
     if len(labels) < 2:
         return tuple(rows), 0, len(labels)
     ordered = sorted(labels.values(), key=lambda one: (-len(one), min(one.values())))
-    frames = set(ordered[0])
-    kept = sorted(ordered[0].values())
-    beside: list[int] = []
+    frames, beside = ordered[0], list[int]()
     for one in ordered[1:]:
-        same = cells[kept[0]][kind] == cells[min(one.values())][kind]
-        twice = frames & one.keys()
-        if same and len(one) >= _CONFIRMED_ROWS and 2 * len(twice) < len(one):
-            kept = sorted([*kept, *(index for frame, index in one.items() if frame not in twice)])
-            frames |= set(one)
+        same = cells[min(frames.values())][kind] == cells[min(one.values())][kind]
+        twice = frames.keys() & one.keys()
+        if same and len(one) >= _CONFIRMED_ROWS and 2 * len(twice) < len(one) and _in_one_place(cells, frames, one):
+            frames = one | frames
             beside.append(len(twice))
         else:
             beside.append(len(one))
+    kept = sorted(frames.values())
     if sum(beside) > SEVERAL_SHARE * len(kept):
         return (), 0, 1 + max(sum(count >= _CONFIRMED_ROWS for count in beside), 1)
     out = io.StringIO()
@@ -49,6 +48,16 @@ def rows_of_one_target(rows: Sequence[str]) -> tuple[tuple[str, ...], int, int]:
         row = cells[index]
         writer.writerow([*row[:label], row[kind] or cells[kept[0]][label], *row[label + 1 :]])
     return tuple(out.getvalue().splitlines()), sum(beside), 1
+
+
+def _in_one_place(cells: list[list[str]], mine: dict[str, int], other: dict[str, int]) -> bool:
+    """Whether two labels, by frame, are within a target's size of each other where both are seen, or never are."""
+    u, v, size = (HEADER.split(",").index(name) for name in ("u", "v", "size"))
+    near = [
+        hypot(*(float(a[at]) - float(b[at]) for at in (u, v))) <= max(float(one[size] or 0.0) for one in (a, b))
+        for a, b in ((cells[mine[frame]], cells[other[frame]]) for frame in mine.keys() & other.keys())
+    ]
+    return 2 * sum(near) >= len(near)
 
 
 def rows_of_unlabelled_people(videos: Iterable[Sequence[str]]) -> list[str]:

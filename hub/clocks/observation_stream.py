@@ -55,7 +55,7 @@ class ObservationStream:
         """Forget the observations; what is known of the clocks is kept."""
         self.marker = SessionBuilder(self._window_s)
         self.people = PeopleTracklets(_PEOPLE_WINDOW_S if self._window_s is None else self._window_s)
-        self._held: dict[tuple[str, str], deque[pb.Observation]] = {}
+        self._held: dict[tuple[str, str], deque[tuple[float, pb.Observation]]] = {}
 
     def release(self, camera: str) -> None:
         """Forget a camera; what is known of its clock is kept."""
@@ -92,35 +92,58 @@ class ObservationStream:
         if isinstance(message, pb.Observation) and any(map(tracked_kind, message.detections)):
             if admits_people is None or admits_people(message):
                 self.people.handle(message)
-                self._hold(message)
+                self._hold(message, now)
             message = without_tracked(message)
         self.marker.handle(message, now)
         if isinstance(message, pb.Observation) and self._rate_changes.cameras:
             self._extend_old_segment(message, now)
         return message
 
-    def _hold(self, message: pb.Observation) -> None:
-        """Keep a frame with people as it is; live of the present clock only, of no more cameras than are compared."""
+    def _hold(self, message: pb.Observation, arrival: float) -> None:
+        """Keep a frame's people; live of the present clock only, of no more cameras than are compared."""
+        people = [one for one in message.detections if one.kind == PERSON]
         key, live = (message.camera, message.boot_id), self._window_s is not None
-        if not any(one.kind == PERSON for one in message.detections):
+        if not people:
             return
         if live and key not in self._held:
-            self._held = {other: held for other, held in self._held.items() if other[0] != message.camera}
+            recent = arrival - self.people_window_s
+            self._held = {
+                other: held for other, held in self._held.items() if other[0] != key[0] and held[-1][0] >= recent
+            }
             if len(self._held) >= _LIVE_CAMERAS:
                 return
-        mine, now = self._held.setdefault(key, deque()), message.device_time_ns
-        if mine and now - mine[-1].device_time_ns < MIN_INTERVAL_NS:
+        longest = round(self.people_window_s * NANOSECONDS / MIN_INTERVAL_NS) + 1
+        mine = self._held.setdefault(key, deque(maxlen=longest if live else None))
+        # One that waited, or of a stamp that was right after a wrong one, may be older than the last.
+        if mine and 0 <= message.device_time_ns - mine[-1][1].device_time_ns < MIN_INTERVAL_NS:
             return
-        mine.append(message)
-        window_s = min(_LIVE_PEOPLE_S, self._window_s) if self._window_s is not None else _PEOPLE_WINDOW_S
-        while mine[0].device_time_ns < now - window_s * NANOSECONDS:
+        plain = without_tracked(message)
+        del plain.detections[:]
+        plain.detections.extend(people)
+        for one in plain.detections:
+            one.ClearField("label")
+        mine.append((arrival, plain))
+        while not live and mine[0][1].device_time_ns < message.device_time_ns - self.people_window_s * NANOSECONDS:
             mine.popleft()
 
-    def several_people(self) -> dict[str, tuple[pb.Observation, ...]]:
-        """The frames with people by camera, of the boot id with most; empty where no two people are seen at once."""
-        longest = dict(sorted(self._held, key=lambda key: len(self._held[key])))
-        held = {name: tuple(self._held[name, boot]) for name, boot in longest.items()}
-        return held if are_several([*itertools.chain(*held.values())]) else {}
+    @property
+    def people_window_s(self) -> float:
+        """How much of the past unlabelled people's frames are kept of [s]."""
+        return _PEOPLE_WINDOW_S if self._window_s is None else min(_LIVE_PEOPLE_S, self._window_s)
+
+    def several_people(self, now: float = 0.0) -> dict[str, tuple[pb.Observation, ...]]:
+        """The frames with people by camera, of the boot id with most; empty where no two people are seen at once.
+
+        now: of the arrivals; what came longer ago than the window, as from a camera that sees nobody any more, is not
+        of the same film as the others'.
+        """
+        window_ns, found = self.people_window_s * NANOSECONDS, dict[str, tuple[pb.Observation, ...]]()
+        for name, boot in sorted(self._held, key=lambda key: len(self._held[key])):
+            mine = self._held[name, boot]
+            last_ns, late = mine[-1][1].device_time_ns, [one for at, one in mine if at >= now - self.people_window_s]
+            if recent := [one for one in late if abs(one.device_time_ns - last_ns) <= window_ns]:
+                found[name] = tuple(sorted(recent, key=lambda one: one.device_time_ns))
+        return found if are_several([*itertools.chain(*found.values())]) else {}
 
     def has_info(self, camera: str) -> bool:
         """Whether a camera has introduced itself: without its image size it is not calibrated."""

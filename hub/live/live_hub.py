@@ -138,8 +138,8 @@ class LiveHub:
         self._submitted_at = 0.0
         self._submitted_boots: dict[str, str] = {}
         self._answer_rows = 0.0
-        self._by_place, self._followed = False, tuple[pb.Observation, ...]()
-        """Whether the present answer is by where unlabelled people stand, and their frames in the last job."""
+        self._by_place, self._followed = False, dict[str, int]()
+        """Whether the present answer is by where unlabelled people stand; their newest frames in the last job [ns]."""
         self.calibration: Calibration | None = None
         self.session: tuple[Rig, Observations] | None = None
         self.refusal: Refused | None = None
@@ -507,7 +507,8 @@ class LiveHub:
         """Hand the present observations to the solver; a final job searches for every camera that is not tied."""
         try:
             heard, observations, people = self._build_session()
-            if people and people == self._followed and not final:
+            newest = {one.camera: one.device_time_ns for one in people}
+            if people and newest.items() <= self._followed.items() and not final:
                 return []  # nobody was in view since
             rig, observations = self._without_other_pixels(heard, observations, people)
         except Refused as refusal:
@@ -520,7 +521,7 @@ class LiveHub:
         left_out = self._schedule.left_out
         if left_out in rig.cameras and len(rig.cameras) > 2:
             rig, observations = without_camera(rig, observations, left_out)
-        self._followed, people = people, tuple(one for one in people if one.camera in rig.cameras)
+        self._followed, people = newest, tuple(one for one in people if one.camera in rig.cameras)
         source = self._source()
         boots = {name: source.boot(name) for name in rig.cameras}
         last = self._start_from(boots)
@@ -637,8 +638,9 @@ class LiveHub:
             self._take_check(answer)
             return []
         tied, cameras = (len(one.cameras) if one else 0 for one in (self.calibration, job and job.rig))
-        by_colour = job is None or (answer.calibration is not None and answer.observations is None)
-        cpu_s = max(answer.cpu_s, 0.0 if by_colour or job is None else _FRAME_CPU_S * len(job.people))
+        cpu_s = answer.cpu_s
+        if job is not None and job.compares_places and (answer.observations is not None or answer.calibration is None):
+            cpu_s = max(cpu_s, _FRAME_CPU_S * len(job.people))
         self._schedule.pause(self._submitted_at, cpu_s, calibrated=2 * tied > cameras)
         if job is None or answer.number <= self._superseded:
             return []
@@ -789,14 +791,15 @@ class LiveHub:
         And the frames of several unlabelled people, as soon as two cameras have filmed them for long enough.
         """
         of_marker = self._has_marker() or not self.settings.solve
-        held = {} if of_marker else self.stream.several_people()
+        held = {} if of_marker else self.stream.several_people(self._now)
         rig, observations = self.stream.build(of_marker, refusing=False)
         spans = [(one[-1].device_time_ns - one[0].device_time_ns) / NANOSECONDS for one in held.values()]
-        least = _COLOURS_FILM_S if len(observations) else _MIN_FILM_S
+        least = min(_COLOURS_FILM_S if len(observations) else _MIN_FILM_S, 0.8 * self.stream.people_window_s)
         people = tuple(itertools.chain(*held.values())) if sum(span >= least for span in spans) >= 2 else ()
         if not of_marker and not people and not len(observations):
-            later = f"; where they stand is compared after {least:.0f} s" if held else ""
-            raise Refused(f"{AMBIGUOUS_COLOURS}{later}")
+            said = ", ".join(f"{name} {span:.0f} s" for name, span in list(zip(held, spans, strict=True))[:8])
+            later = f"; where they stand is compared once two cameras have filmed them for {least:.0f} s ({said})"
+            raise Refused(f"{AMBIGUOUS_COLOURS}{later if held else ''}")
         return merge_rigs(rig, self._rig), observations, people
 
     def _without_other_pixels(

@@ -23,7 +23,8 @@ class ScheduledHub(LiveHub):
     """A hub that solves what its log says, when it says so, instead of when it is due.
 
     The answers are those of the recorded hub bit for bit where the recorder lost nothing that the hub had, except after
-    a change of a clock's rate, whose correction the log does not hold.
+    a change of a clock's rate, whose correction the log does not hold, and of jobs by people: these are given at the
+    recorded times, of the people who are known then and without times of arrival.
     """
 
     def __init__(self) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copyreg
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol
@@ -41,6 +41,7 @@ _FIRST_FULL_S = 60.0
 arrival it finds nothing more."""
 _LEFT_OUT_S = 60.0
 """How long a camera is left out without which the solver does not fail."""
+_NOBODY_MET = "none of the people in it was followed together with another camera"
 _CAMERAS, _FRAMES = 240, 600
 """Of a job that is not large. Of people who are followed a frame costs 0.01 s of CPU, of a crowd of 25 0.05."""
 _UNLIKE_OTHERS = 2.5
@@ -77,6 +78,11 @@ class SolverJob:
     refine_lenses: bool = False
     people: tuple[pb.Observation, ...] = ()
     by_place: bool = False
+
+    @property
+    def compares_places(self) -> bool:
+        """Whether where people stand is tried, if colours do not suffice."""
+        return bool(self.people) and (self.by_place or self.last is None or self.full or self.verify)
 
     @property
     def load(self) -> float:
@@ -174,8 +180,8 @@ def _ways(job: SolverJob) -> list[Callable[[], Update]]:
 
     An answer by colours goes on so; those whom these leave out are looked for by place with the searches over all lags.
     """
-    ways: list[Callable[[], Update]] = [] if job.by_place else [partial(_by_labels, job)]
-    if job.people and (job.by_place or job.last is None or job.full or job.verify):
+    ways: list[Callable[[], Update]] = [] if job.by_place and job.people else [partial(_by_labels, job)]
+    if job.compares_places:
         ways.append(partial(_by_place, job))
     return ways
 
@@ -202,39 +208,46 @@ def _by_place(job: SolverJob) -> Update:
     """The answer by where people stand; from the last one on those are followed who meet at its lags."""
     from hub.calibration.people.unlabelled import calibrate_people, follow_people
 
-    common = {**({} if job.full and job.last is None else job.arrivals), **job.clock_priors}
     if job.last is None:
+        common = {**({} if job.full else job.arrivals), **job.clock_priors}
         found, observations = calibrate_people(job.rig, job.people, priors=common)
         return Update(found, observations=observations)
     people = [one for one in job.people if job.search or one.camera in job.last.cameras]
     try:
-        followed = follow_people(job.rig, people, priors=_at_its_lags(job.last, people, common))
+        clocks = () if job.full else (job.arrivals, job.clock_priors)
+        followed = follow_people(job.rig, people, priors=_at_its_lags(job.last, people, clocks))
     except Refused as refusal:  # that nobody is seen by two cameras contradicts no camera
         raise Refused(refusal.reason) from refusal
     update = _by_labels(replace(job, observations=followed.observations))
-    found = update.calibration
-    found = replace(found, refused={name: followed.refused.get(name, why) for name, why in found.refused.items()})
+    found, met = update.calibration, set(followed.observations.cameras)
+    refused = {name: why if name in met else _NOBODY_MET for name, why in found.refused.items()} | followed.refused
+    found = replace(found, refused={name: refused[name] for name in found.refused})
     return replace(update, calibration=found, observations=followed.observations)
 
 
 def _at_its_lags(
-    last: Calibration, people: Sequence[pb.Observation], common: Mapping[str, ExternalClockPrior]
+    last: Calibration, people: Sequence[pb.Observation], clocks: Iterable[Mapping[str, ExternalClockPrior]]
 ) -> dict[str, ExternalClockPrior]:
-    """Priors of all clocks on the reference clock of an answer: its own lags, and others' by a common clock."""
+    """Priors of all clocks on the reference clock of an answer: its own lags, and others' by each of some clocks.
+
+    clocks: priors on the hub's clock, by arrival, and on Unix time; the later count.
+    """
     newest = {one.camera: CameraTime(one.device_time_ns / NANOSECONDS) for one in people}
     lags = {
         name: float(one.time_map.reference_from_camera(newest[name])) - newest[name]
         for name, one in last.cameras.items()
         if name in newest
     }
-    shifts = [common[name].unix_minus_camera - lag for name, lag in lags.items() if name in common]
-    shift = float(np.median(shifts)) if shifts else 0.0
-    others = {
-        name: replace(one, unix_minus_camera=one.unix_minus_camera - shift, error_bound=2.0 * one.error_bound)
-        for name, one in common.items()
-        if shifts and name not in lags
-    }
-    return {name: ExternalClockPrior("", lag, 0.0) for name, lag in lags.items()} | others
+    found = {name: ExternalClockPrior("", lag, 0.0) for name, lag in lags.items()}
+    for common in clocks:
+        shifts = [common[name].unix_minus_camera - lag for name, lag in lags.items() if name in common]
+        shift = float(np.median(shifts)) if shifts else 0.0
+        found |= {
+            name: replace(one, unix_minus_camera=one.unix_minus_camera - shift, error_bound=2.0 * one.error_bound)
+            for name, one in common.items()
+            if shifts and name not in lags
+        }
+    return found
 
 
 def _verified(job: SolverJob) -> Calibration:

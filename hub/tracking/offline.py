@@ -90,8 +90,8 @@ def follow(
 
     observations: in any order; their times are on each camera's clock. times_ns: reference times at which positions
     are wanted. up: (3,) unit vector in the world frame; None: estimated from upright people. iterations: of association
-    and linking over the whole; with none, tracks are the live tracker's. progress: gets the done share. Raises Refused
-    if nobody can be followed.
+    and linking over the whole; with none, tracks are those of the forward pass. progress: gets the done share. Raises
+    Refused if nobody can be followed.
     """
     cameras = {name: TrackingCamera.from_calibration(camera) for name, camera in calibration.cameras.items()}
     frames = sorted(

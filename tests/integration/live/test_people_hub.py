@@ -330,6 +330,7 @@ def test_unlabelled_people_calibrate_the_hub_and_are_tracked() -> None:
     again.reload(found, hub.boot_ids, hub.delays)
     for info in traffic.infos:
         again.handle(info)
+    again.tick(40.0)  # the frames arrive at the hub's time, of which it knows by its ticks
     for at, message in traffic.arrivals:
         again.handle(message, 1e9 + at)
     for now in (80.0, 81.0, 82.0):

@@ -44,6 +44,14 @@ def test_a_track_that_goes_on_for_some_frames_beside_its_successor_is_one_target
     assert rows_of_one_target(_rows(("p0", range(100, 200)), ("p1", range(130)))) == ((), 0, 2)
 
 
+def test_who_is_elsewhere_beside_the_target_is_another_one() -> None:
+    here, there = (Detection(u, 20.0, 30.0, 0.9, label, kind="person") for u, label in ((10.0, "a"), (500.0, "b")))
+    seen = {n: (n / 10, [*[here] * (n < 100), *[there] * (n >= 97)]) for n in range(107)}
+    rows, removed, targets = rows_of_one_target(tuple(detection_rows("cam", seen)))
+    assert (removed, targets) == (10, 1)
+    assert _labels(rows) == [(frame, "person") for frame in range(100)]
+
+
 def test_more_than_a_tenth_beside_it_is_a_second_target() -> None:
     assert rows_of_one_target(_rows(("p0", range(100)), ("p1", range(20, 31)))) == ((), 0, 2)
     assert rows_of_one_target(_rows(("p0", range(100)), ("p1", range(20, 30))))[1:] == (10, 1)
