@@ -18,6 +18,7 @@ from edge.uav.georeference import Georeference
 from edge.uav.ground.image_plane import ImagePlane
 from edge.uav.ground.localisation import frame_from_telemetry
 from edge.uav.navigation import interpolate_positions
+from edge.uav.target.box import MIN_BOX_PX
 from edge.uav.timing.telemetry_track import TelemetryTrack
 from hub.view.uav_overlay import dots
 from protocols.core.clocks import NANOSECONDS
@@ -89,7 +90,9 @@ def corners_for_a_box(box: Box, size: tuple[int, int]) -> tuple[str, ...]:
     """A warning where a box seems to be given by two corners. size: of the picture [px]."""
     x, y, width, height = box.x, box.y, box.width, box.height
     between, area = (width - x) * (height - y), width * height
-    if not (x < width and y < height and area > max(_LARGE * size[0] * size[1], _MUCH_LARGER * between)):
+    if not (
+        min(width - x, height - y) >= MIN_BOX_PX and area > max(_LARGE * size[0] * size[1], _MUCH_LARGER * between)
+    ):
         return ()
     corners = f"--target {x:g},{y:g},{width - x:g},{height - y:g}"
     return (f"the target is {width:g}x{height:g} px of {size[0]}x{size[1]}: if you gave two corners, give {corners}",)

@@ -247,6 +247,12 @@ class WithoutBars:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
         check_target_box(image, self._size, target)
         self._area = x, y, width, height = picture_area(image)
+        inside = replace(target, x=target.x - x, y=target.y - y)
+        try:
+            check_target_box(self._cut(image), (width, height), inside)
+        except InputError:  # there is something to see where it was marked: these are no bars
+            self._area, inside = (0, 0, *self._size), target
+            x, y, width, height = self._area
         if (width, height) != self._size:
             lens = self._lens
             if lens is not None:
@@ -255,7 +261,6 @@ class WithoutBars:
             self._tracker = AdaptiveTracker((width, height), lens, *self._others)
             for sample in self._samples:
                 self._tracker.handle_telemetry(sample)
-        inside = replace(target, x=target.x - x, y=target.y - y)
         return self._in_image(self._tracker.begin(self._cut(image), time, inside))
 
     def handle_telemetry(self, sample: Telemetry) -> None:

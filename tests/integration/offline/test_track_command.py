@@ -254,6 +254,7 @@ def test_a_box_that_may_be_two_corners_is_warned_of(box: str) -> None:
     [warning] = corners_for_a_box(parse_target("301,200,323,247"), (640, 480))
     assert warning.endswith("give --target 301,200,22,47")
     assert not corners_for_a_box(parse_target(box), (640, 480))
+    assert not corners_for_a_box(parse_target("5,5,6,6"), (16, 16))  # no box of 1x1
 
 
 def test_files_that_are_no_video_are_rejected(

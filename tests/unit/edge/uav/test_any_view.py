@@ -18,6 +18,7 @@ from edge.uav.image_motion.scene_motion import STILL, SceneMotion
 from edge.uav.target.box import check_target_box
 from edge.uav.tracker_factory import make_tracker
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Image
 from tests.support.oblique.world import ObliqueWorld
@@ -446,3 +447,18 @@ def test_a_turn_must_show_in_the_similarity(scene: Image, turned: float, kept: b
 def test_a_box_drawn_somewhat_beyond_the_border_is_taken(box: tuple[int, ...]) -> None:
     image = np.random.default_rng(0).integers(0, 256, (720, 1280, 3), np.uint8)
     check_target_box(image, (1280, 720), Box(*map(float, box)))
+
+
+@pytest.mark.parametrize("size", [(800, 16), (16, 700), (1400, 28), (800, 8), (12, 300), (1400, 20)])
+def test_pictures_that_are_narrow_are_followed_or_refused(scene: Image, size: tuple[int, int]) -> None:
+    """They ended in OpenCV's own errors."""
+    tracker, (width, height) = make_tracker("ground", size), size
+    wide = np.tile(scene, (2, 2, 1))
+    try:
+        tracker.begin(np.ascontiguousarray(wide[:height, :width]), 0.0, Box(2.0, 2.0, 10.0, 5.0))
+    except InputError as error:
+        assert "too narrow" in str(error)
+        assert min(size) < 16 or 50 * min(size) < max(size)
+        return
+    for k in range(1, 4):
+        tracker.handle_frame(np.ascontiguousarray(wide[40 * k : height + 40 * k, 40 * k : width + 40 * k]), 0.1 * k)
