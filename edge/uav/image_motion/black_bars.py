@@ -26,7 +26,7 @@ def picture_area(image: Image) -> tuple[int, int, int, int]:
 
 
 def _between(image: Image, dark: Image) -> tuple[int, int]:
-    """Start and number of the rows between two equal bars; all where there are none. dark: (H, W) 255 in dark pixels."""
+    """Start and number of the rows between two equal bars; all where there are none. dark: (H, W), 255 where it is."""
     rows = np.flatnonzero(dark.mean(axis=1) < 255.0 * (1.0 - _LIT))
     if not rows.size:
         return 0, len(dark)
