@@ -126,7 +126,10 @@ def read_telemetry(file: Path) -> TelemetryFile:
     length = np.linalg.norm(table[:, 1:5], axis=1)
     usable = np.isfinite(table[:, :5]).all(axis=1) & (length > 0.5) & (length < 2.0)
     if not usable.any():
-        raise InputError("no usable row", file=file, line=1, remedy="record telemetry with attitude quaternions")
+        other = ": its quaternions are not of length 1" if np.isfinite(table[:, :5]).all(axis=1).any() else ""
+        raise InputError(
+            f"no usable row{other}", file=file, line=1, remedy="record telemetry with attitude quaternions"
+        )
     left_out, table = int((~usable).sum()), table[usable]
     back = int((np.diff(table[:, 0]) < 0.0).sum())
     table = table[np.argsort(table[:, 0], kind="stable")]
