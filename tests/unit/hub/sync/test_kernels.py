@@ -17,7 +17,7 @@ import pytest
 from edge.uav.base import Box
 from edge.uav.correlation.features import cell_features
 from edge.uav.ground import colour_table
-from edge.uav.ground.ego_motion import EgoMotion, _solve_pose
+from edge.uav.ground.ego_motion import EgoMotion, _solve_pose, reduced
 from edge.uav.ground.image_plane import ImagePlane
 from edge.uav.ground.photometric import _blurred_colours
 from edge.uav.ground.plane_pose import PlaneHomography, PlanePose
