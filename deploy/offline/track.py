@@ -18,6 +18,7 @@ from edge.uav.georeference import Georeference
 from edge.uav.ground.image_plane import ImagePlane
 from edge.uav.ground.localisation import frame_from_telemetry
 from edge.uav.navigation import interpolate_positions
+from edge.uav.target.box import MIN_BOX_PX
 from edge.uav.timing.telemetry_track import TelemetryTrack
 from hub.view.uav_overlay import dots
 from protocols.core.clocks import NANOSECONDS
@@ -89,7 +90,9 @@ def corners_for_a_box(box: Box, size: tuple[int, int]) -> tuple[str, ...]:
     """A warning where a box seems to be given by two corners. size: of the picture [px]."""
     x, y, width, height = box.x, box.y, box.width, box.height
     between, area = (width - x) * (height - y), width * height
-    if not (x < width and y < height and area > max(_LARGE * size[0] * size[1], _MUCH_LARGER * between)):
+    if not (
+        min(width - x, height - y) >= MIN_BOX_PX and area > max(_LARGE * size[0] * size[1], _MUCH_LARGER * between)
+    ):
         return ()
     corners = f"--target {x:g},{y:g},{width - x:g},{height - y:g}"
     return (f"the target is {width:g}x{height:g} px of {size[0]}x{size[1]}: if you gave two corners, give {corners}",)
@@ -123,7 +126,10 @@ def read_telemetry(file: Path) -> TelemetryFile:
     length = np.linalg.norm(table[:, 1:5], axis=1)
     usable = np.isfinite(table[:, :5]).all(axis=1) & (length > 0.5) & (length < 2.0)
     if not usable.any():
-        raise InputError("no usable row", file=file, line=1, remedy="record telemetry with attitude quaternions")
+        other = ": its quaternions are not of length 1" if np.isfinite(table[:, :5]).all(axis=1).any() else ""
+        raise InputError(
+            f"no usable row{other}", file=file, line=1, remedy="record telemetry with attitude quaternions"
+        )
     left_out, table = int((~usable).sum()), table[usable]
     back = int((np.diff(table[:, 0]) < 0.0).sum())
     table = table[np.argsort(table[:, 0], kind="stable")]

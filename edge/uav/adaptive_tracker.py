@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from edge.uav.base import Basis, Box, Estimate, Telemetry, TrackState
 from edge.uav.correlation.appearance_tracker import AppearanceTracker
 from edge.uav.correlation.oriented_box import OrientedBox
-from edge.uav.ground.photometric import contrast_table
+from edge.uav.ground.photometric import Contrast
 from edge.uav.ground_tracker import GroundTracker
 from edge.uav.image_motion.black_bars import picture_area
 from edge.uav.image_motion.repeated_images import is_repeated
@@ -66,8 +65,8 @@ class AdaptiveTracker:
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
         assert self._ground is not None
-        self._contrast = contrast_table(image)
-        image = self._stretched(image)
+        self._contrast = Contrast(image, time)
+        image = self._contrast.stretched(image, time)
         self._viewed, self._viewed_at = image, time
         first = self._ground.begin(image, time, target)
         seen = self._appearance.begin(image, time, target)
@@ -87,7 +86,7 @@ class AdaptiveTracker:
 
         An image that repeats one with the target has that one's estimate: it says nothing of the time since.
         """
-        image = None if image is None else self._stretched(image)
+        image = None if image is None else self._contrast.stretched(image, time)
         if image is not None and self._last.state is TrackState.VISIBLE and is_repeated(self._viewed, image):
             recent = time - self._viewed_at <= _REPEATED_S
             return replace(self._last, time=time, state=TrackState.VISIBLE if recent else TrackState.COASTING)
@@ -129,9 +128,6 @@ class AdaptiveTracker:
             self._shift = np.array([seen.x - ground.x, seen.y - ground.y])
             self._sides = np.array([seen.width / ground.width, seen.height / ground.height])
         return self._on_ground(self._corrected(ground))
-
-    def _stretched(self, image: Image) -> Image:
-        return image if self._contrast is None else np.asarray(cv2.LUT(image, self._contrast), np.uint8)
 
     def road_outline(self) -> tuple[Floats, Floats | None]:
         """The observed road near the target, see ``GroundTracker``."""
@@ -247,6 +243,12 @@ class WithoutBars:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
         check_target_box(image, self._size, target)
         self._area = x, y, width, height = picture_area(image)
+        inside = replace(target, x=target.x - x, y=target.y - y)
+        try:
+            check_target_box(self._cut(image), (width, height), inside)
+        except InputError:  # there is something to see where it was marked: these are no bars
+            self._area, inside = (0, 0, *self._size), target
+            x, y, width, height = self._area
         if (width, height) != self._size:
             lens = self._lens
             if lens is not None:
@@ -255,7 +257,6 @@ class WithoutBars:
             self._tracker = AdaptiveTracker((width, height), lens, *self._others)
             for sample in self._samples:
                 self._tracker.handle_telemetry(sample)
-        inside = replace(target, x=target.x - x, y=target.y - y)
         return self._in_image(self._tracker.begin(self._cut(image), time, inside))
 
     def handle_telemetry(self, sample: Telemetry) -> None:

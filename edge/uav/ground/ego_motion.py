@@ -19,13 +19,14 @@ from edge.uav.ground.image_plane import ImagePlane, apply_homography, inverse
 from edge.uav.ground.plane_pose import PlaneCamera, PlaneHomography, PlanePose
 from protocols.geometry import kernels, so3
 from protocols.geometry.order_statistics import median, quantile
-from protocols.geometry.types import Bools, Floats
+from protocols.geometry.types import Bools, Floats, Image
 
 Gray = npt.NDArray[np.uint8]
 
 _WORKING_WIDTH = 430  # approximate width of the image on which Lucas-Kanade runs [px]
 _MAX_TRACKS = 110  # for six unknowns: more cost CPU, fewer leave too few where buildings hide the ground
 LK_WINDOW = 13  # px of the working image: smaller ones fail on little texture, larger ones mix roofs and ground
+_MOST_REDUCED = 257  # rows, of which sixteen bits hold the sum
 _MAX_ITERATIONS = 6  # Gauss-Newton steps, a bound: three narrow the kernel, and it stops where it has converged
 _MAX_LEVELS = 2  # halvings of the image for Lucas-Kanade
 _PYRAMID_MARGIN = 4.0  # how much farther from where they are expected corners may be than in the frame before
@@ -73,18 +74,9 @@ class EgoMotion:
         self.frames_without_pose = 0
         """Consecutive frames without a trusted pose."""
 
-    def working_image(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    def working_image(self, image: Image) -> Image:
         """The image reduced by ``downscale``."""
-        if self.downscale == 1:
-            return image
-        height, width = image.shape[:2]
-        working_size = (width // self.downscale, height // self.downscale)
-        if kernels.AVAILABLE and self.downscale > 2:  # half the size is fast in OpenCV
-            out, sums = np.empty((working_size[1], working_size[0], 3), np.uint8), np.empty(3 * width, np.uint16)
-            kernels.call("reduce_image", height, width, self.downscale, np.ascontiguousarray(image), sums, out)
-            return out
-        whole = image[: working_size[1] * self.downscale, : working_size[0] * self.downscale]
-        return np.asarray(cv2.resize(whole, working_size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return reduced(image, self.downscale)
 
     def begin(self, gray: Gray, pose: PlanePose | PlaneHomography, excluded: Floats | None) -> None:
         """Start with the first working image. excluded: (4, 2) pixels of the target's outline."""
@@ -367,4 +359,17 @@ def _fuse(information: Floats, prior: Floats, part: slice, error: Floats, std: F
     prior[part] = weight * error / information[part]
 
 
-__all__ = ["EgoMotion", "EgoMotionReport", "PlaneCamera"]
+def reduced(image: Image, factor: int) -> Image:
+    """The means of squares of ``factor`` px of an image (h, w, 3); what is left over right and below is cut off."""
+    height, width = (side // factor for side in image.shape[:2])
+    if factor == 1:
+        return image
+    if kernels.AVAILABLE and 2 < factor <= _MOST_REDUCED:  # half the size is fast in OpenCV
+        out, sums = np.empty((height, width, 3), np.uint8), np.empty(3 * image.shape[1], np.uint16)
+        kernels.call("reduce_image", *image.shape[:2], factor, np.ascontiguousarray(image), sums, out)
+        return out
+    whole = image[: height * factor, : width * factor]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+__all__ = ["EgoMotion", "EgoMotionReport", "PlaneCamera", "reduced"]

@@ -19,6 +19,7 @@ _MAX_TARGET_LOG_GAIN = 0.7  # half or twice the light
 _TARGET_DECAY_S = 1.5  # time constant: longer ones keep a shadow that it has left, shorter ones forget it behind a tree
 _NEGLIGIBLE_LOG_GAIN = 0.02  # five of 255 levels at most: not worth a new table
 _EXTREMES = (0.02, 0.98)  # quantiles of the levels of the darkest and the lightest places
+_FADE_S, _FADES = 2.0, 1.15  # a fade from black is over; growth of this distance by which it is one, not the view's
 _FLAT, _SPAN, _MAX_FACTOR = 96.0, 160.0, 8.0  # distance of these that is too small; that it gets; limit of the factor
 
 
@@ -89,17 +90,42 @@ class TargetGain:
         self.log_gain *= float(np.exp(-dt / _TARGET_DECAY_S))
 
 
-def contrast_table(image: Image) -> Image | None:
-    """Lookup table (1, 256) that gives images a contrast to which noise and compression are small; None: they have it.
+class Contrast:
+    """Stretches faint images, so that noise and compression are small: at dusk and in haze a few tens of levels lie
+    between the darkest and the lightest.
 
-    image: the first one, (h, w, 3). At dusk and in haze a few tens of levels lie between its darkest and its lightest.
+    image: the first one, (h, w, 3), at ``time`` [s]. Images of one with contrast stay as they are. While a video fades
+    in, what it lacks becomes less.
     """
-    darkest, lightest = (float(level) for level in np.quantile(image[::4, ::4], _EXTREMES))
-    if lightest - darkest >= _FLAT:
-        return None
-    factor = min(_SPAN / max(lightest - darkest, 1.0), _MAX_FACTOR)
-    levels = (np.arange(256) - darkest) * factor + min(darkest, 255.0 - _SPAN)
-    return np.asarray(np.clip(np.rint(levels), 0, 255), np.uint8)[None]
+
+    def __init__(self, image: Image, time: float) -> None:
+        self._fades_until = time + _FADE_S
+        self.table: Image | None = None
+        """Lookup table (1, 256); None where the first image has contrast."""
+        darkest, lightest = _extremes(image)
+        if lightest - darkest < _FLAT:
+            self._stretch(darkest, lightest)
+
+    def stretched(self, image: Image, time: float) -> Image:
+        """An image (h, w, 3) at ``time`` [s] with contrast."""
+        if self.table is None:
+            return image
+        if time < self._fades_until:
+            darkest, lightest = _extremes(image)
+            if lightest - darkest > _FADES * self._span:
+                self._stretch(darkest, lightest)
+        return np.asarray(cv2.LUT(image, self.table), np.uint8)
+
+    def _stretch(self, darkest: float, lightest: float) -> None:
+        self._span = max(lightest - darkest, 1.0)
+        factor = min(max(_SPAN / self._span, 1.0), _MAX_FACTOR)
+        levels = (np.arange(256) - darkest) * factor + min(darkest, 255.0 - _SPAN)
+        self.table = np.asarray(np.clip(np.rint(levels), 0, 255), np.uint8)[None]
+
+
+def _extremes(image: Image) -> tuple[float, float]:
+    darkest, lightest = np.quantile(image[::4, ::4], _EXTREMES)
+    return float(darkest), float(lightest)
 
 
 def _lookup_table(gain: Floats) -> Image:

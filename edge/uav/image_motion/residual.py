@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.ground.ego_motion import reduced
 from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats, Image, Singles
 
@@ -116,9 +117,7 @@ class MovingParts:
 
     def _keep(self, image: Image, time: float) -> None:
         # At least a pixel: the box of a target that is away grows beyond the image with a view that zooms in.
-        size = (max(image.shape[1] // self._reduction, 1), max(image.shape[0] // self._reduction, 1))
-        small = image if self._reduction == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        self._now = np.asarray(small, np.uint8)
+        self._now = reduced(image, min(self._reduction, *image.shape[:2]))
         if not self._past or time - self._past[-1][0] > _KEEP_S:
             self._past.append((time, self._now, np.eye(3)))
 

@@ -23,6 +23,7 @@ from protocols.geometry.types import Bools, Floats, Image
 Gray = npt.NDArray[np.uint8]
 
 _WORKING_WIDTH = 400  # approximate width of the image on which the flow is computed [px]
+_HALVED = 4  # times the working width: wider images are halved first, which changes their means by rounding only
 _MAX_TRACKS = 120  # for four unknowns: more cost CPU, fewer leave parts of the image to what moves in them
 _LK_LEVELS = 3  # halvings of the image: half a window of the smallest one is 48 px
 _BACKWARD_PX = 0.7  # forward-backward distance of a good track [px of the working image]
@@ -110,8 +111,10 @@ class SceneMotion:
 
     def update(self, image: Image, excluded: Floats | None) -> Motion:
         """The motion since the last image. excluded: x0, y0, x1, y1 of the moving target in the last image [px]."""
-        small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), self._size, interpolation=cv2.INTER_AREA)
-        gray = np.asarray(small, np.uint8)
+        small = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        while small.shape[1] >= _HALVED * self._size[0]:  # of ultra-HD, in a third of the time
+            small = cv2.resize(small, (small.shape[1] // 2, small.shape[0] // 2), interpolation=cv2.INTER_AREA)
+        gray = np.asarray(cv2.resize(small, self._size, interpolation=cv2.INTER_AREA), np.uint8)
         previous, self._gray = self._gray, gray
         if previous is None:
             self.photometric.update(gray, np.zeros((0, 2)), np.zeros((0, 2)))

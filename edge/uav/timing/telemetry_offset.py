@@ -30,6 +30,7 @@ _GAP_FACTOR = 2.5  # times the median spacing: a longer one is a gap
 _MAX_SPAN_S = 6 * 3600.0  # of images or telemetry: the grids of six hours take 50 MB, and no battery lasts longer
 _MAX_SPACING_S = 0.25 * _HIGH_PASS_WINDOW_S  # of attitudes, for a contradiction: in between it may turn at will
 _MIN_TURN_RMS = float(np.radians(1.0))  # of attitudes about their mean of 2 s: 0.4 degrees of noise do not reach it
+_FROZEN_RMS = 1e-6  # rad, likewise: rounding of one attitude that is repeated; no sensor is as calm
 CONTRADICTION = "attitudes turn otherwise than the images"
 """Begins the reason where telemetry is of another mounting, camera, gimbal or convention."""
 OUTSIDE = "the offset lies outside the search window"
@@ -126,8 +127,12 @@ class OffsetSearch:
 
     @property
     def contradicts(self) -> bool:
-        """Whether the telemetry turns by so much that the images would have to show it, and they do not."""
-        return self.evidence < self.threshold and self.telemetry_rms >= _MIN_TURN_RMS and self.spacing <= _MAX_SPACING_S
+        """Whether the telemetry turns by so much that the images would have to show it, and they do not; or the images
+        do, and it is the same in every digit."""
+        rms, (seen, known) = self.telemetry_rms, self.visual
+        if rms < _FROZEN_RMS:
+            rms = float(np.sqrt(np.square(seen[known > 0]).sum() / max(known.sum(), 1.0)))
+        return self.evidence < self.threshold and rms >= _MIN_TURN_RMS and self.spacing <= _MAX_SPACING_S
 
 
 def search_offset(

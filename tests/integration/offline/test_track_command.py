@@ -224,6 +224,7 @@ def test_the_same_seed_writes_the_same_bytes(recording: Path, tmp_path: Path) ->
         (["--target", TARGET, "--telemetry", "telemetry.csv"], "body_from_camera"),
         (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "other_clock.csv"], "video's clock"),
         (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "all_nan.csv"], "no usable row"),
+        (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "degrees.csv"], "quaternions are not of length 1"),
         (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "headless.csv"], "column"),
         (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "words.csv"], "words.csv:2"),
         (["--target", TARGET, "--rig", "rig.toml", "--telemetry", "flight.tlog"], "tlog"),
@@ -237,6 +238,7 @@ def test_bad_input_gives_one_line_and_exit_status_2(
     header = "time,qw,qx,qy,qz\n"
     (recording / "other_clock.csv").write_text(header + "".join(f"{1.7e9 + k / 10},1,0,0,0\n" for k in range(30)))
     (recording / "all_nan.csv").write_text(header + "nan,nan,nan,nan,nan\n")
+    (recording / "degrees.csv").write_text(header + "0,0,-12.5,3.1,170.2\n")
     (recording / "headless.csv").write_text("0,1,0,0,0\n")
     (recording / "words.csv").write_text(header + "0,one,0,0,0\n")
     (recording / "flight.tlog").write_bytes(b"\xfe\x00")
@@ -254,6 +256,7 @@ def test_a_box_that_may_be_two_corners_is_warned_of(box: str) -> None:
     [warning] = corners_for_a_box(parse_target("301,200,323,247"), (640, 480))
     assert warning.endswith("give --target 301,200,22,47")
     assert not corners_for_a_box(parse_target(box), (640, 480))
+    assert not corners_for_a_box(parse_target("5,5,6,6"), (16, 16))  # no box of 1x1
 
 
 def test_files_that_are_no_video_are_rejected(
@@ -354,6 +357,7 @@ def _scaled(q: Floats) -> Floats:
         (lambda q: q * [1, -1, -1, -1], "would if they were body_from_ned"),
         (lambda q: so3.quaternion(_ENU @ so3.from_quaternion(q) @ _FLU), "would if they were ROS's enu_from_flu"),
         (_scaled, "but not as the video does: check body_from_camera"),
+        (lambda q: np.array([0.9, 0.1, 0.3, 0.3]), "turn by 0.0 degrees rms, but not as the video does"),
     ],
 )
 def test_attitudes_that_turn_otherwise_than_the_video_are_named(

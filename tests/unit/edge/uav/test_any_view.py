@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import cv2
@@ -18,6 +19,7 @@ from edge.uav.image_motion.scene_motion import STILL, SceneMotion
 from edge.uav.target.box import check_target_box
 from edge.uav.tracker_factory import make_tracker
 from edge.uav.world.flight import BODY_FROM_DOWN_CAMERA
+from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Image
 from tests.support.oblique.world import ObliqueWorld
@@ -446,3 +448,25 @@ def test_a_turn_must_show_in_the_similarity(scene: Image, turned: float, kept: b
 def test_a_box_drawn_somewhat_beyond_the_border_is_taken(box: tuple[int, ...]) -> None:
     image = np.random.default_rng(0).integers(0, 256, (720, 1280, 3), np.uint8)
     check_target_box(image, (1280, 720), Box(*map(float, box)))
+
+
+@pytest.mark.parametrize(
+    ("size", "taken"),
+    [
+        ((800, 16), True),
+        ((16, 700), True),
+        ((1400, 28), True),
+        ((800, 8), False),
+        ((12, 300), False),
+        ((1400, 20), False),
+    ],
+)
+def test_pictures_that_are_narrow_are_followed_or_refused(scene: Image, size: tuple[int, int], taken: bool) -> None:
+    """They ended in OpenCV's own errors."""
+    (width, height), wide = size, np.tile(scene, (2, 2, 1))
+    images = [np.ascontiguousarray(wide[k : height + k, k : width + k]) for k in (0, 40, 80, 120)]
+    tracker = make_tracker("ground", size)
+    with nullcontext() if taken else pytest.raises(InputError, match="too narrow"):
+        tracker.begin(images[0], 0.0, Box(2.0, 2.0, 10.0, 5.0))
+        for k in (1, 2, 3):
+            tracker.handle_frame(images[k], 0.1 * k)

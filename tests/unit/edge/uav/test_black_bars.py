@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.uav.base import Estimate, Telemetry
+from edge.uav.base import Box, Estimate, Telemetry
 from edge.uav.image_motion.black_bars import picture_area
 from edge.uav.tracker_factory import make_tracker
 from protocols.geometry.camera import Intrinsics
@@ -66,3 +66,27 @@ def test_dark_parts_of_a_picture_are_no_bars() -> None:
     night[:90] = 3  # the sky
     assert picture_area(night) == (0, 0, 320, 240)
     assert picture_area(np.zeros_like(night)) == (0, 0, 320, 240)
+
+
+def test_a_hot_target_and_dark_ends_of_the_ground_are_no_picture_between_bars() -> None:
+    """A hot target in the middle of cold ground was cut out of it; so was the ground between two dark ends."""
+    rng = np.random.default_rng(2)
+    cold = rng.normal(12, 3, (240, 320, 3)).clip(0, 30).astype(np.uint8)
+    hot = cv2.ellipse(cold.copy(), (160, 120), (14, 30), 0, 0, 360, (230, 230, 230), -1)
+    assert picture_area(hot) == (0, 0, 320, 240)
+    flat = cv2.ellipse(np.zeros_like(cold), (160, 120), (14, 30), 0, 0, 360, (230, 230, 230), -1)
+    assert picture_area(flat) == (0, 0, 320, 240)
+    road = cold.copy()
+    road[60:180] = rng.integers(40, 200, (120, 320, 3))
+    assert picture_area(road) == (0, 0, 320, 240)
+    upright = barred(road[60:180, :68], 74, 0)
+    assert picture_area(upright) == (74, 0, 68, 120)
+
+
+def test_what_is_marked_is_in_the_picture() -> None:
+    """A target in a dark end was refused with numbers that nobody gave; so was one that fills half of what is lit."""
+    image = barred(np.random.default_rng(1).integers(40, 200, (120, 320, 3)).astype(np.uint8), 0, 60)
+    cv2.rectangle(image, (30, 20), (60, 40), (28, 28, 28), -1)
+    for box in (Box(30.0, 20.0, 30.0, 20.0), Box(0.0, 50.0, 250.0, 100.0)):
+        e = make_tracker("ground", (320, 240)).begin(image, 0.0, box)
+        assert (e.x, e.y) == pytest.approx((box.x + 0.5 * box.width, box.y + 0.5 * box.height), abs=1.0)

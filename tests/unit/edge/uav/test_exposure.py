@@ -9,10 +9,11 @@ import pytest
 from edge.uav.base import Box
 from edge.uav.correlation.filter import CorrelationFilter
 from edge.uav.correlation.oriented_box import OrientedBox
-from edge.uav.ground.photometric import contrast_table
+from edge.uav.ground.photometric import Contrast
 from edge.uav.image_motion.scene_motion import SceneMotion
 from edge.uav.tracker_factory import make_tracker
 from protocols.core.errors import InputError
+from protocols.geometry.types import Image
 from tests.bench.uav_any_view import in_light
 from tests.support.oblique.world import ObliqueWorld
 
@@ -32,14 +33,19 @@ def test_the_scenes_motion_is_measured_while_the_exposure_changes() -> None:
     assert motion.photometric.gain[0] == pytest.approx(1.0 + 0.25 * np.sin(1.3 * 11), rel=0.08)
 
 
-@pytest.mark.parametrize("light", ["flicker", "dusk"])
+def faded(image: Image, k: int) -> Image:
+    """Image ``k`` of a video that fades in from black within 15 images."""
+    return np.asarray(min((k + 1.0) / 15.0, 1.0) * image, np.uint8)
+
+
+@pytest.mark.parametrize("light", ["flicker", "dusk", "fade"])
 def test_a_target_is_followed_in_any_light(light: str) -> None:
     world = ObliqueWorld("bicycle", "follow", seed=2, frames=45, fps=15.0)
     tracker = make_tracker("ground", world.size, fps=world.fps)
     near = 0
     for k in range(45):
         image, truth = world.rendered(k)
-        image, box = in_light(image, light, k), truth.box
+        image, box = faded(image, k) if light == "fade" else in_light(image, light, k), truth.box
         e = tracker.begin(image, 0.0, box) if k == 0 else tracker.handle_frame(image, k / world.fps)
         near += bool(np.hypot(e.x - box.x - 0.5 * box.width, e.y - box.y - 0.5 * box.height) < max(box.width, 12.0))
     assert near >= 42
@@ -49,13 +55,13 @@ def test_a_target_is_followed_in_any_light(light: str) -> None:
 def test_contrast_is_never_reduced_and_levels_keep_their_order(low: int) -> None:
     image = np.full((40, 40, 3), low, np.uint8)
     image[:, 20:] = low + 30
-    table = contrast_table(image)
+    table = Contrast(image, 0.0).table
     assert table is not None
     levels = table.ravel().astype(int)
     assert (np.diff(levels) >= 0).all()
     assert levels[low + 30] - levels[low] >= 100
-    assert contrast_table(cv2.merge([np.tile(np.arange(256, dtype=np.uint8), (40, 1))] * 3)) is None
-    assert contrast_table(np.zeros((40, 40, 3), np.uint8)) is not None  # nothing to see, and no division by zero
+    assert Contrast(cv2.merge([np.tile(np.arange(256, dtype=np.uint8), (40, 1))] * 3), 0.0).table is None
+    assert Contrast(np.zeros((40, 40, 3), np.uint8), 0.0).table is not None  # nothing to see, and no division by zero
 
 
 @pytest.mark.parametrize("model", ["ground", "plain", "paper"])
