@@ -26,7 +26,6 @@ Gray = npt.NDArray[np.uint8]
 _WORKING_WIDTH = 430  # approximate width of the image on which Lucas-Kanade runs [px]
 _MAX_TRACKS = 110  # for six unknowns: more cost CPU, fewer leave too few where buildings hide the ground
 LK_WINDOW = 13  # px of the working image: smaller ones fail on little texture, larger ones mix roofs and ground
-_MOST_REDUCED = 257  # rows, of which sixteen bits hold the sum
 _MAX_ITERATIONS = 6  # Gauss-Newton steps, a bound: three narrow the kernel, and it stops where it has converged
 _MAX_LEVELS = 2  # halvings of the image for Lucas-Kanade
 _PYRAMID_MARGIN = 4.0  # how much farther from where they are expected corners may be than in the frame before
@@ -364,7 +363,7 @@ def reduced(image: Image, factor: int) -> Image:
     height, width = (side // factor for side in image.shape[:2])
     if factor == 1:
         return image
-    if kernels.AVAILABLE and 2 < factor <= _MOST_REDUCED:  # half the size is fast in OpenCV
+    if kernels.AVAILABLE and factor > 2:  # half the size is fast in OpenCV
         out, sums = np.empty((height, width, 3), np.uint8), np.empty(3 * image.shape[1], np.uint16)
         kernels.call("reduce_image", *image.shape[:2], factor, np.ascontiguousarray(image), sums, out)
         return out
