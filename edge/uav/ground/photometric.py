@@ -20,6 +20,7 @@ _TARGET_DECAY_S = 1.5  # time constant: longer ones keep a shadow that it has le
 _NEGLIGIBLE_LOG_GAIN = 0.02  # five of 255 levels at most: not worth a new table
 _EXTREMES = (0.02, 0.98)  # quantiles of the levels of the darkest and the lightest places
 _FADE_S, _FADES = 2.0, 1.15  # a fade from black is over; growth of this distance by which it is one, not the view's
+_CUT = 2.0  # growth from one image to the next: of no fade, but of an image that is damaged or of another scene
 _FLAT, _SPAN, _MAX_FACTOR = 96.0, 160.0, 8.0  # distance of these that is too small; that it gets; limit of the factor
 
 
@@ -112,7 +113,7 @@ class Contrast:
             return image
         if time < self._fades_until:
             darkest, lightest = _extremes(image)
-            if lightest - darkest > _FADES * self._span:
+            if _FADES < (lightest - darkest) / self._span < _CUT:
                 self._stretch(darkest, lightest)
         return np.asarray(cv2.LUT(image, self.table), np.uint8)
 
