@@ -242,6 +242,7 @@ class WithoutBars:
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
         check_target_box(image, self._size, target)
+        before = self._area[2:]
         self._area = x, y, width, height = picture_area(image)
         inside = replace(target, x=target.x - x, y=target.y - y)
         try:
@@ -249,7 +250,7 @@ class WithoutBars:
         except InputError:  # there is something to see where it was marked: these are no bars
             self._area, inside = (0, 0, *self._size), target
             x, y, width, height = self._area
-        if (width, height) != self._size:
+        if (width, height) != before:
             lens = self._lens
             if lens is not None:
                 matrix = lens.matrix - [[0.0, 0.0, x], [0.0, 0.0, y], [0.0, 0.0, 0.0]]

@@ -486,11 +486,12 @@ class LiveHub:
             reloaded = self._publish_reloaded(self._reloaded)
             if reloaded:
                 return reloaded
-        if self.solver.busy or (not final and now < self._schedule.next):
+        busy = self.solver.busy
+        if (busy and self._known is None) or (not final and now < self._schedule.next):
             return []
         self._schedule.next = now + (_VERIFY_EVERY_S if self.unverified else self.settings.interval_s)
         if self._known is not None:
-            if not final:
+            if not (final or busy):
                 self._check_known(now)
             return self._publish_present(changed=False)
         if not self.settings.solve:

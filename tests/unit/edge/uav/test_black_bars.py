@@ -10,7 +10,7 @@ from edge.uav.base import Box, Estimate, Telemetry
 from edge.uav.image_motion.black_bars import picture_area
 from edge.uav.tracker_factory import make_tracker
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Image
+from protocols.geometry.types import Floats, Image
 from tests.support.oblique.world import ObliqueWorld
 
 BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -53,6 +53,43 @@ def test_bars_beside_the_picture_change_nothing() -> None:
                 assert (own.x - x, own.y - y) == pytest.approx((other.x, other.y))
             if e.particles is not None and bars.particles is not None:
                 assert bars.particles - [x, y] == pytest.approx(e.particles, nan_ok=True)
+
+
+def test_another_begin_is_of_its_own_image() -> None:
+    """Begun anew on an image without bars, all its images were of another size than the first one's picture."""
+    picture = np.random.default_rng(1).integers(40, 200, (240, 320, 3)).astype(np.uint8)
+    tracker = make_tracker("ground", (320, 300), fps=FPS)
+    for image in (barred(picture, 0, 30), cv2.resize(picture, (320, 300))):
+        assert tracker.begin(np.asarray(image, np.uint8), 0.0, Box(140, 130, 40, 30)).state.value == "visible"
+
+
+def test_what_is_shown_and_where_the_target_may_be_are_of_the_image() -> None:
+    """A car that drives out of the picture along a street seen from above: particles, corners, paths and the road."""
+    rng = np.random.default_rng(7)
+    ground = cv2.GaussianBlur(rng.uniform(-1, 1, (240, 900, 3)).astype(np.float32), (0, 0), 2.0)
+    ground = np.clip(np.array([60.0, 120.0, 80.0]) + 160.0 * ground, 0, 255).astype(np.uint8)
+    ground[90:150] = ground[90:150] // 3 + 60
+
+    def drive(y: int) -> tuple[Estimate, Floats]:
+        tracker = make_tracker("ground", (320, 240 + 2 * y), fps=FPS)
+        for i in range(44):
+            image, left = ground.copy(), 40 + i
+            cv2.rectangle(image, (100 + 8 * i, 112), (136 + 8 * i, 128), (40, 40, 210), -1)
+            image = barred(image[:, left : left + 320], 0, y)
+            box = Box(60.0, 112.0 + y, 37.0, 17.0)
+            found = tracker.begin(image, 0.0, box) if i == 0 else tracker.handle_frame(image, i / 15.0)
+        return found, tracker.road_outline()[0]  # type: ignore[attr-defined]
+
+    (plain, road), (bars, barred_road) = drive(0), drive(30)
+    assert plain.basis.value == bars.basis.value == "plane"
+    assert plain.particles is not None
+    assert bars.particles is not None
+    assert len(plain.layers) >= 3
+    assert len(road)
+    np.testing.assert_allclose(bars.particles - [0, 30], plain.particles)
+    for name, points in plain.layers.items():
+        np.testing.assert_allclose(bars.layers[name] - [0, 30], points)
+    np.testing.assert_allclose(barred_road - [0, 30], road)
 
 
 def test_dark_parts_of_a_picture_are_no_bars() -> None:

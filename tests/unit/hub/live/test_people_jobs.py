@@ -11,7 +11,8 @@ from hub.calibration.incremental import Update
 from hub.calibration.people.ways import first_complete
 from hub.clocks.external_prior import ExternalClockPrior
 from hub.clocks.observation_stream import ObservationStream
-from hub.live.solver import SolverJob, _at_its_lags, _ways, run_job
+from hub.live.live_hub import KnownCalibration, LiveHub
+from hub.live.solver import InlineSolver, SolverJob, _at_its_lags, _ways, run_job
 from protocols.core.clocks import NANOSECONDS, TimeMap
 from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
@@ -19,7 +20,7 @@ from protocols.geometry.pose import Pose
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.observations import Observations
-from protocols.session.rig import Rig
+from protocols.session.rig import Rig, RigCamera
 
 LENS = Intrinsics(640, 480, np.array([[450.0, 0, 319.5], [0, 450.0, 239.5], [0, 0, 1.0]]))
 
@@ -130,3 +131,18 @@ def test_the_second_way_is_tried_where_the_first_leaves_a_camera_out() -> None:
     assert first_complete([lambda: replace(two), lambda: refuse("no")], "abcd").calibration is two.calibration
     with pytest.raises(Refused, match="by colour: alike; by where people stand: nobody"):
         first_complete([lambda: refuse("alike"), lambda: refuse("nobody")], "abc")
+
+
+def test_a_given_calibration_is_published_while_it_is_tested() -> None:
+    """By people a test takes half a minute of CPU, in which a listener that had just joined knew of no calibration."""
+
+    class Busy(InlineSolver):
+        @property
+        def busy(self) -> bool:
+            return True
+
+    known = answer(camera("a", 0.0), camera("b", 5.0))
+    rig = Rig({name: RigCamera(name, (640, 480), 30.0, LENS) for name in "ab"}, metadata={"reference": "a"})
+    hub = LiveHub(solver=Busy(), known=KnownCalibration(rig, known.cameras))
+    found = [one for now in range(8) for one in hub.tick(float(now)) if isinstance(one, pb.Calibration)]
+    assert len(found) >= 3
