@@ -14,7 +14,7 @@ from hub.tracking.calibration.vertical import VerticalEstimator
 from hub.tracking.detections import TrackingCamera, tracked_kind
 from hub.tracking.filter.kalman import LOG_SIZE
 from hub.tracking.filter.target_models import PERSON
-from hub.tracking.filter.target_states import MultiTargetState
+from hub.tracking.filter.target_states import MultiTargetState, Targets
 from hub.tracking.marker_tracks import MarkerTracks
 from hub.tracking.messages import prediction_message, track_messages
 from hub.tracking.tracker import Tracker
@@ -100,7 +100,7 @@ class LiveTracking:
         if self.tracker.cameras and not held:
             change = _gauge_change(self.tracker.cameras, new)
         metric = scale == "metric"
-        units_per_m = _METRES.get(units, 1.0) if metric else _guessed_units_per_m(new)
+        units_per_m = _METRES.get(units, 1.0) if metric else guessed_units_per_m(new)
         if not metric and not self._scale.metric and change is not None:
             units_per_m = self._scale.units_per_m * change.scale
         elif not metric and not self._scale.metric and self.tracker.cameras:
@@ -213,16 +213,20 @@ class LiveTracking:
         """With arbitrary scale, estimate the world units per metre from the heights of tracked people."""
         if self._scale.metric or self.tracker.parameters.up is None:
             return
-        targets = self.tracker.targets
-        sizes = np.exp(targets.mean[targets.confirmed & (targets.kind == 0), LOG_SIZE])
-        if len(sizes):
-            units_per_m = float(np.median(sizes)) / PERSON.size_m
-            if abs(np.log(units_per_m / self._scale.units_per_m)) > 0.1:
-                self._scale = LengthScale(units_per_m, False)
-                self._set_parameters(self.tracker.parameters.up)
+        found = scale_of_people(self.tracker.targets, self._scale)
+        if found is not self._scale:
+            self._scale = found
+            self._set_parameters(self.tracker.parameters.up)
 
 
-def _guessed_units_per_m(cameras: Mapping[str, TrackingCamera]) -> float:
+def scale_of_people(targets: Targets, scale: LengthScale) -> LengthScale:
+    """The scale of a world without units, by the heights of its confirmed people; ``scale`` within a tenth of it."""
+    sizes = np.exp(targets.mean[targets.confirmed & (targets.kind == 0), LOG_SIZE])
+    units_per_m = float(np.median(sizes)) / PERSON.size_m if len(sizes) else scale.units_per_m
+    return scale if abs(np.log(units_per_m / scale.units_per_m)) <= 0.1 else LengthScale(units_per_m, False)
+
+
+def guessed_units_per_m(cameras: Mapping[str, TrackingCamera]) -> float:
     """Guess of the world units per metre, for cameras spaced as in a room."""
     places = np.array([camera.pose.position for camera in cameras.values()])
     distances = np.linalg.norm(places[:, None] - places[None], axis=2)

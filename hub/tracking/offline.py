@@ -16,6 +16,7 @@ from hub.tracking.filter.kalman import LOG_SIZE, POSITION, VELOCITY
 from hub.tracking.filter.target_models import TARGET_MODELS
 from hub.tracking.filter.target_states import MultiTargetState, Targets
 from hub.tracking.frame_update import jointly, process_frame
+from hub.tracking.live_tracking import guessed_units_per_m, scale_of_people
 from hub.tracking.parameters import TrackerParameters
 from hub.tracking.smoothing import ITERATIONS, LOG_ABSENT, BatchSmoother, RecordedScan, SmoothedScan
 from protocols.core.clocks import NANOSECONDS
@@ -25,6 +26,9 @@ from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration
 from protocols.session.rig import METRES_PER_UNIT
 
+_SCALE_FRAMES, _SCALE_PASSES = 400, 2
+"""Frames by whose people the scale of a world without units is known to a tenth, ten seconds of four cameras; and how
+often: a guess that is far off finds the first person only."""
 _MIN_LOG_ODDS = 3.0
 """Of a track's existence over its whole life: one in twenty of the accepted ones at the limit is false."""
 _COASTING_S = 0.35
@@ -108,10 +112,13 @@ def follow(
         up = vertical.estimate({name: camera.pose for name, camera in cameras.items()})
         if up is None:
             warnings.append("the vertical is unknown: targets are followed as points, without a ground")
-    units_per_m = 1.0 / METRES_PER_UNIT[calibration.units] if calibration.scale == "metric" else 1.0
-    scale = LengthScale(units_per_m, calibration.scale == "metric")
+    metric = calibration.scale == "metric"
+    units_per_m = 1.0 / METRES_PER_UNIT[calibration.units] if metric else guessed_units_per_m(cameras)
     # Who has left is known from the whole recording: until its end nobody is given up soon.
-    parameters = TrackerParameters(up=up, scale=scale, lifetime_s=60.0)
+    parameters = TrackerParameters(up=up, scale=LengthScale(units_per_m, metric), lifetime_s=60.0)
+    for _ in range(0 if metric or up is None else _SCALE_PASSES):
+        _, begun = _tracked(frames[:_SCALE_FRAMES], cameras, parameters, lambda share: None)
+        parameters = replace(parameters, scale=scale_of_people(begun.targets, parameters.scale))
     said = progress or (lambda share: None)
     recorded, state = _tracked(frames, cameras, parameters, lambda share: said(0.5 * share))
     del frames

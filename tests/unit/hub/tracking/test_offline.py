@@ -34,6 +34,7 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, CameraCalibration
+from tests.bench import hall
 
 UP = np.array([0.0, 0.0, 1.0])
 LENS = Intrinsics(1280, 720, np.array([[900.0, 0, 639.5], [0, 900.0, 359.5], [0, 0, 1.0]]))
@@ -503,3 +504,18 @@ def test_a_vehicle_before_cameras_of_different_rates() -> None:
     calibration = Calibration(cameras=cameras, reference="cam0", scale="metric", units="m", solver="given", version="")
     result = follow(messages, calibration, [round(frame / 30 * NANOSECONDS) for frame in range(75)], up=UP)
     assert [len(track.times) > 50 for track in result.tracks] == [True]
+
+
+@pytest.mark.parametrize("units_per_m", [0.12, 30.0])
+def test_a_world_without_units_has_the_scale_of_its_people(units_per_m: float) -> None:
+    """Calibrated without a length, a baseline of 8 m was taken for 1 m, and of six people two were followed."""
+    seen = hall.simulated(4, cameras=4, people=6, fps=5.0, seconds=10.0, half=2.5)
+    cameras = {
+        name: replace(one, pose=replace(one.pose, position=units_per_m * one.pose.position))
+        for name, one in seen.calibration.cameras.items()
+    }
+    world = replace(seen.calibration, cameras=cameras, scale="arbitrary", units="baselines")
+    messages, times = [message for _, message in seen.messages], [round(t * NANOSECONDS) for t in seen.times]
+    found = follow(messages, world, times, up=hall.UP)
+    assert len(found.tracks) == 6
+    assert min(one.used for one in found.cameras.values()) > 0.8
