@@ -5,7 +5,7 @@ No sockets, files or clocks: `syncline calibrate` and the live hub run the same 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -19,7 +19,7 @@ from hub.calibration.pairs.moved_pair import likely_maps, moves_of_two, time_map
 from hub.calibration.pairs.pair_network import Progress, frame_rate_warnings, solve_pairs
 from hub.calibration.pairs.pair_reports import isolated_pair_report
 from hub.calibration.resection.moved_cameras import Move, moved_cameras, without_moved
-from hub.calibration.resection.set_clocks import between_settings, set_clocks
+from hub.calibration.resection.set_clocks import SetClock, between_settings, set_clocks, unexplained_sides
 from hub.calibration.result import assemble_calibration
 from hub.calibration.solvers import (
     Solution,
@@ -140,7 +140,7 @@ def calibrate(
             _check(calibration, rig, observations, again if may_move or online else None)
             return calibration
     except Refused as refusal:
-        if may_move and (found := _between_settings(prepared.cameras, observations, again)):
+        if may_move and (found := _between_settings(set_clocks(prepared.cameras, observations), observations, again)):
             return found
         likely = likely_maps(rig, observations, prepared, pairs) if of_two else ()
         if not (moves := moves_of_two(prepared, likely, observations, online)):
@@ -184,7 +184,8 @@ def _from_still_parts(
     Also None where what is left says too little: then all rows have to do.
     """
     left_out = [name for name in solution.prepared.cameras if name in solution.refused]
-    if found := _between_settings(left_out, observations, again):
+    clocks = set_clocks(left_out, observations) | unexplained_sides(solution, observations)
+    if found := _between_settings(clocks, observations, again):
         return found
     if moves := moved_cameras(solution, observations):
         with suppress(Refused):
@@ -226,10 +227,10 @@ def _median_rms(found: Calibration) -> float:
 
 
 def _between_settings(
-    names: Iterable[str], observations: Observations, again: Callable[[Observations], Calibration]
+    clocks: Mapping[str, SetClock], observations: Observations, again: Callable[[Observations], Calibration]
 ) -> Calibration | None:
-    """The calibration from the longest part of these cameras between jumps of their clocks; None if it places none."""
-    if not (clocks := set_clocks(names, observations)):
+    """The calibration from one side of these jumps of cameras' clocks; None without any, or if it places none."""
+    if not clocks:
         return None
     try:
         found = again(between_settings(observations, clocks))

@@ -139,6 +139,18 @@ def test_vehicles_that_fit_at_another_lag_are_warned_of(tmp_path: Path, late: fl
         assert added == pytest.approx(-late if text.startswith(NAMES[1]) else late, abs=0.3)
 
 
+@pytest.mark.parametrize("late", [0.0, 0.2, 1.4, -3.0])
+def test_people_who_meet_at_another_lag_are_warned_of(tmp_path: Path, late: float) -> None:
+    """Of a room followed with the clocks of another recording, four people became ten tracks without a word."""
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml", offsets={NAMES[1]: late}))
+    warnings = read_follow_input(rows(tmp_path, boxes_csv(30.0)), known, "person", tmp_path).warnings
+    if abs(late) < 1.0:
+        assert warnings == ()
+        return
+    (warning,) = [one for one in warnings if "time_offset" in one]
+    assert warning.startswith(f"{NAMES[1]}: its people fit those of {NAMES[0]}, {NAMES[2]} with about {-late:+.1f} s")
+
+
 def test_boxes_beyond_the_border_are_not_cut_there(tmp_path: Path) -> None:
     text = BOXES + f"left,0,0,100,600,40,{SIZE[1] - 600}\nleft,0,0,300,-30,40,90\n"
     (message,), _ = followed_detections(object_messages(read_objects(rows(tmp_path, text), SIZES)), "person", SIZES)
