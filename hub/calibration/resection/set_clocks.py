@@ -23,9 +23,9 @@ from protocols.session.observations import Observations
 _MOST_SETTINGS = 3
 """Jumps of a clock in a recording: with more, as of shuffled rows, it is none."""
 _LEAST_EXPLAINED = 0.5
-"""Share of inliers in a part, over that of the camera's best part, below which its clock is another one. In 9 simulated
-worlds pauses left at least 0.97, clocks set by 0.5 s and more 0 to 0.21 in 12 of 16; where they left more, other tests
-of clocks and moves found them."""
+"""Share of inliers in a part, over that of the camera's best part, below which its clock is another one. In simulated
+worlds pauses left at least 0.97, clocks set by 0.5 s and more 0 to 0.21; where they left more, other tests of clocks
+and moves found them."""
 
 
 @dataclass(frozen=True, slots=True)
