@@ -178,7 +178,9 @@ class Redetection:
         scores = self._memory.scores(image, trials)
         score, box = float(scores.max()), trials[int(scores.argmax())]
         cues = answer.log_ratio + self._moving.log_ratio(box.centre)
-        candidate.add(box, self._memory.log_ratio(score, _CHANGE, cues) + self._colour.log_ratio(image, box, away=True), dt)
+        candidate.add(
+            box, self._memory.log_ratio(score, _CHANGE, cues) + self._colour.log_ratio(image, box, away=True), dt
+        )
         return candidate.promising and box.share_inside(self._size) > _MIN_INSIDE
 
 
