@@ -15,8 +15,6 @@ _INNER, _SIDE = 0.5, 8  # of a box's sides, for its corners show background; sid
 # Std of the same thing's colour from view to view [8-bit levels of L*, a*, b*]; rendered targets of less than 8 px, of
 # 8 to 12 and of 12 to 20 px: (4.0, 3.1, 2.5), (7.6, 2.5, 2.4), (3.5, 1.5, 1.5).
 _NOISE = np.array([6.0, 2.4, 2.4])
-# Std of its lightness after an absence [8-bit levels]: nadir cars, 0.5 s away, in shade or turned to the sun: 11.
-_AWAY = np.array([12.0, 0.0, 0.0])
 _BROAD = np.array([40.0, 16.0, 16.0])  # and of whatever else there may be
 _LEARNING = 0.05  # share of a new observation
 _GREY = np.array([0.0, 128.0, 128.0])  # a* and b* of no colour, in 8 bits
@@ -43,17 +41,16 @@ class ColourModel:
         for box in boxes:
             self._others = _updated(self._others, _mean(image, box))
 
-    def log_ratio(self, image: Image, box: OrientedBox, *, in_any_light: bool = False, away: bool = False) -> float:
+    def log_ratio(self, image: Image, box: OrientedBox, *, in_any_light: bool = False) -> float:
         """log p(colour | target) - log p(colour | anything else), natural, bounded.
 
         in_any_light: by a* and b* as they were at the target's mean lightness: a shadow is no other paint.
-        away: of a target that has not been seen for a while.
         """
         colour, first, gain = _mean(image, box), 0, 1.0
         if in_any_light:
             first, gain = 1, float(self._target[0, 0] / max(colour[0], 1.0))
             colour = _GREY + gain * (colour - _GREY)
-        noise = max(gain, 1.0) * (np.hypot(_NOISE, _AWAY) if away else _NOISE)
+        noise = max(gain, 1.0) * _NOISE
         target, near, wide = (
             float(-0.5 * ((colour - mean) ** 2 / variance + np.log(variance))[first:].sum())
             for (mean, spread), floor in ((self._target, noise), (self._others, noise), (self._others, _BROAD))

@@ -129,7 +129,7 @@ class Redetection:
         odds = [
             self._memory.log_ratio(f.score, _CHANGE, self._moving.log_ratio(f.box.centre))
             + prior
-            + self._colour.log_ratio(image, f.box, away=True)
+            + self._colour.log_ratio(image, f.box)
             for f, prior in zip(new, priors, strict=True)
         ]
         order = np.argsort(odds)[::-1]
@@ -178,9 +178,7 @@ class Redetection:
         scores = self._memory.scores(image, trials)
         score, box = float(scores.max()), trials[int(scores.argmax())]
         cues = answer.log_ratio + self._moving.log_ratio(box.centre)
-        candidate.add(
-            box, self._memory.log_ratio(score, _CHANGE, cues) + self._colour.log_ratio(image, box, away=True), dt
-        )
+        candidate.add(box, self._memory.log_ratio(score, _CHANGE, cues) + self._colour.log_ratio(image, box), dt)
         return candidate.promising and box.share_inside(self._size) > _MIN_INSIDE
 
 

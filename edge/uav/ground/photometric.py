@@ -104,13 +104,14 @@ class Contrast:
         self._fades_until = time + _FADE_S
         self.table: Image | None = None
         """Lookup table (1, 256); None where the first image has contrast."""
-        darkest, lightest = _extremes(image[::4, ::4])
+        darkest, lightest = of_all = _extremes(image[::4, ::4])
         if box is not None:
             x, y = max(int(box[0]), 0), max(int(box[1]), 0)
             ends = _extremes(image[y : int(box[1] + box[3]) + 1, x : int(box[0] + box[2]) + 1])
             darkest, lightest = min(darkest, ends[0]), max(lightest, ends[1])
         if lightest - darkest < _FLAT:
             self._stretch(darkest, lightest)
+            self._span = max(of_all[1] - of_all[0], 1.0)  # where the target is in the next images is not known
 
     def stretched(self, image: Image, time: float) -> Image:
         """An image (h, w, 3) at ``time`` [s] with contrast."""

@@ -501,9 +501,6 @@ def test_one_look_at_another_paint_does_not_make_it_the_targets_and_a_shadow_is_
     assert model.log_ratio(flat(200, 120, 60), box) == -4.0
     assert model.log_ratio(flat(200, 120, 60), box, in_any_light=True) == -4.0
     assert model.log_ratio(flat(30, 60, 100), box) < 0.0 < model.log_ratio(flat(30, 60, 100), box, in_any_light=True)
-    model, lighter = ColourModel(flat(100, 100, 100), box), flat(124, 124, 124)  # as cars that come out of the shade
-    assert model.log_ratio(lighter, box) < -2.0
-    assert model.log_ratio(lighter, box, away=True) > 0.0
 
 
 def test_one_of_its_kind_that_passes_before_the_target_does_not_take_it_along(scene: Image) -> None:
