@@ -358,12 +358,17 @@ def test_a_place_is_not_followed_where_the_motion_of_the_scene_is_lost() -> None
         assert moved == (place.at(np.array([73.0, 120.0])) if known else None)
 
 
+def begun(image: Image, centre: np.ndarray) -> AppearanceTracker:
+    tracker = AppearanceTracker(SIZE, FPS)
+    tracker.begin(image, 0.0, Box(*(centre - 0.5 * TARGET), *map(float, TARGET)))
+    return tracker
+
+
 def test_a_box_that_stays_with_the_tree_before_it_goes_to_where_its_target_has_moved(
     scene: Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start = np.array([70.0, 120.0])
-    tracker = AppearanceTracker(SIZE, FPS)
-    tracker.begin(behind_a_tree(scene, start), 0.0, Box(*(start - 0.5 * TARGET), *map(float, TARGET)))
+    tracker = begun(behind_a_tree(scene, start), start)
     gone = OrientedBox(*(start - [12.0, 0.0]), *map(float, TARGET))
     monkeypatch.setattr(tracker._first_motion, "look", lambda image, seconds, scene: (gone, np.array([-30.0, 0.0])))
     found = tracker.handle_frame(behind_a_tree(scene, gone.centre), 0.4)
@@ -376,8 +381,7 @@ def test_a_box_that_went_with_its_target_is_not_moved_to_a_place_that_it_passed(
 ) -> None:
     """Fast cars: a mark on the road, near where they were at first, was taken for them."""
     start = np.array([70.0, 120.0])
-    tracker = AppearanceTracker(SIZE, FPS)
-    tracker.begin(painted(scene, start), 0.0, Box(*(start - 0.5 * TARGET), *map(float, TARGET)))
+    tracker = begun(painted(scene, start), start)
     tracker.box = tracker.box.at(start + [24.0, 0.0])
     tracker.motion = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), True, 1.0)
     mark = tracker.box.at(start + [0.0, 12.0])
