@@ -65,7 +65,7 @@ class AdaptiveTracker:
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
         assert self._ground is not None
-        self._contrast = Contrast(image, time)
+        self._contrast = Contrast(image, time, (target.x, target.y, target.width, target.height))
         image = self._contrast.stretched(image, time)
         self._viewed, self._viewed_at = image, time
         first = self._ground.begin(image, time, target)

@@ -130,6 +130,60 @@ def aerial(folder: Path) -> Iterator[Sequence]:
             yield Sequence(f"car{track}", "nadir", images[: len(box)], box, 30.0, share_inside(box, size))
 
 
+def _turned(whole: Sequence, how: str, factor: float) -> Sequence:
+    """A sequence whose pictures are turned or mirrored, or shown backwards, and reduced by ``factor``."""
+    (width, height), box, way = whole.size, whole.box.copy(), -1 if how == "backwards" else 1
+    if how in ("mirrored", "half turn"):
+        box[:, 0] = width - box[:, 0] - box[:, 2]
+    if how == "half turn":
+        box[:, 1] = height - box[:, 1] - box[:, 3]
+    if how == "quarter turn":
+        box = np.column_stack([height - box[:, 1] - box[:, 3], box[:, 0], box[:, 3], box[:, 2]])
+    sides = {"mirrored": (1, -1, 1), "half turn": (-1, -1, 1), "quarter turn": (-1, 1, 1)}.get(how, (1, 1, 1))
+    axes = (1, 0, 2) if how == "quarter turn" else (0, 1, 2)
+    images = []
+    for image in whole.images[::way]:
+        seen = np.ascontiguousarray(image[:: sides[0], :: sides[1]].transpose(axes))
+        scaled = seen if factor == 1.0 else cv2.resize(seen, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        images.append(np.asarray(scaled, np.uint8))
+    return replace(whole, images=images, box=factor * box[::way])
+
+
+# How the pictures are turned, their factor; first frame, every how many; shift and scale of the first box, in sides;
+# seconds before and while away.
+VARIANTS = (
+    ("as it is", 1.0, 0, 1, 0.0, 1.0, 0.6, 0.5),
+    ("as it is", 1.0, 6, 1, 0.0, 1.0, 0.6, 0.5),
+    ("mirrored", 1.0, 3, 1, 0.1, 1.0, 0.6, 0.5),
+    ("quarter turn", 1.0, 0, 1, 0.0, 1.0, 0.6, 0.5),
+    ("backwards", 1.0, 0, 1, 0.0, 1.0, 0.6, 0.5),
+    ("as it is", 1.0, 0, 2, 0.0, 1.0, 0.6, 0.5),
+    ("half turn", 1.0, 4, 2, 0.0, 1.0, 0.6, 0.5),
+    ("as it is", 1.0, 2, 1, 0.0, 1.4, 0.6, 0.5),
+    ("mirrored", 1.0, 0, 1, 0.0, 0.7, 0.6, 0.5),
+    ("half turn", 0.7, 0, 1, 0.0, 1.0, 0.6, 0.5),
+    ("backwards", 1.0, 0, 2, -0.1, 1.0, 0.6, 0.5),
+    ("quarter turn", 1.0, 0, 1, 0.0, 1.0, 0.4, 0.8),
+)
+
+
+def varied(folder: Path, part: str) -> Iterator[Sequence]:
+    """Windows of the aerial-traffic video in each of ``VARIANTS``; part: of the "even" or the "odd" cars, or "all"."""
+    cars = [pair for pair in enumerate(aerial(folder)) if part == "all" or (pair[0] % 2 == 0) == (part == "even")]
+    for number, (how, factor, first, every, shift, scale, before, away) in enumerate(VARIANTS):
+        for k, car in cars:
+            window = pan_away(_turned(car, how, factor), away, (480, 270), before, 31 * number + k, first)
+            if window is None:
+                continue
+            box = window.box[::every].copy()
+            sides = box[0, 2:].copy()
+            corner = box[0, :2] + (np.array([shift, abs(shift)]) + 0.5 * (1.0 - scale)) * sides
+            box[0] = [*corner, *(scale * sides)]
+            yield replace(
+                window, images=window.images[::every], box=box, visible=window.visible[::every], fps=window.fps / every
+            )
+
+
 def pan_away(
     whole: Sequence, away_s: float, size: tuple[int, int], first_s: float, seed: int, start: int = 0
 ) -> Sequence | None:

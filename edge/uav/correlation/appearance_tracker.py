@@ -216,8 +216,11 @@ class AppearanceTracker:
             return
         seconds = self._time - self._begun
         moved = self._first_motion.look(image, seconds, self._first_place)
-        if moved is not None and np.hypot(*((moved[0].centre - self.box.centre) / moved[0].sides)) > _STAYED:
-            self._go_to(*moved)
+        if moved is not None:
+            stood, sides = self._first_place.centre, self.box.sides
+            went, goes = (float(np.hypot(*((to.centre - stood) / sides))) for to in (self.box, moved[0]))
+            if went < goes and np.hypot(*((moved[0].centre - self.box.centre) / sides)) > _STAYED:
+                self._go_to(*moved)  # else the box has gone with its target, past what is found
         seen = self.box if self.sees else None  # while it is not, it may be hidden, and what moves is something else
         crept = self._median_background.look(image, seconds, self._first_place, seen)
         if crept is not None and self._memory.first_scores(image, [self.box])[0] < _LIKE_FIRST:

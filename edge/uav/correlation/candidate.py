@@ -12,7 +12,6 @@ from protocols.geometry.types import Floats
 
 _ACCEPT = 2.7  # log odds of a re-detection: 2, and ln 2 since each search tries two views
 _TENTATIVE = -3.0  # log odds below which a place is not tested further
-MAX_TESTS = 8  # frames for which a place is tested
 _HITS = 3  # consecutive frames of a re-detection
 _PLACE_STD = 0.05  # of a place measured twice, in target lengths
 KEEPS, _TURNS, _STOPS = 0.75, 0.15, 0.1  # probabilities of what a target has done while away

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.uav.correlation.candidate import KEEPS, MAX_TESTS, Candidate, Kinematics
+from edge.uav.correlation.candidate import KEEPS, Candidate, Kinematics
 from edge.uav.correlation.colour import ColourModel
 from edge.uav.correlation.filter import Response
 from edge.uav.correlation.memory import TemplateMemory
@@ -63,6 +63,7 @@ class Redetection:
         self._size, self._memory, self._localise = size, memory, localise
         # Probabilities that it is near the prediction, that it is in the image, and that it was not seen there.
         self._near, self._inside, self._unnoticed = 1.0, 0.0, 1.0
+        self._left = 1.0  # share of where it was expected that no search has ruled out
         self._colour = colour
         self._tested: list[Candidate] = []
         self._moving = UNKNOWN
@@ -85,8 +86,6 @@ class Redetection:
         """Search one image; the place that is taken for the target, if any: by its odds, and a margin over the next."""
         self._moving = moving
         self._tested = [c for c in self._tested if self._test(image, c, expected, dt)]
-        if any(c.hits > MAX_TESTS for c in self._tested):
-            self._tested = []  # undecided: the others would have no rival any more
         if not self._tested or self._tested[0].log_odds < _PROMISING or expected.frames % 2 == 0:
             self._search(image, expected, dt)
         kept: list[Candidate] = []
@@ -148,6 +147,10 @@ class Redetection:
         unnoticed = (min(self._inside, before) * self._unnoticed + entered) / max(self._inside, 1e-6)
         self._unnoticed = max((1.0 - _DETECTION) * unnoticed, _HIDDEN)
         self._near = 1.0 - self._inside * (1.0 - self._unnoticed)
+        left = min(self._left, self._near)
+        for candidate in self._tested:  # likelier, as a search about the prediction finds nothing else
+            candidate.prior += float(np.log(self._left / left))
+        self._left = left
 
     def _log_prior(self, place: Floats, expected: Prediction) -> float:
         """Log probability that the target is in the box about ``place`` (2,): near the prediction, or anywhere."""

@@ -95,24 +95,30 @@ class Contrast:
     """Stretches faint images, so that noise and compression are small: at dusk and in haze a few tens of levels lie
     between the darkest and the lightest.
 
-    image: the first one, (h, w, 3), at ``time`` [s]. Images of one with contrast stay as they are. While a video fades
-    in, what it lacks becomes less.
+    image: the first one, (h, w, 3), at ``time`` [s], with the target in ``box`` (x, y, width, height) [px]. Images of
+    one with contrast stay as they are, and those of a target that has it: cars on grey asphalt would lose their light
+    parts. While a video fades in, what it lacks becomes less.
     """
 
-    def __init__(self, image: Image, time: float) -> None:
+    def __init__(self, image: Image, time: float, box: tuple[float, float, float, float] | None = None) -> None:
         self._fades_until = time + _FADE_S
         self.table: Image | None = None
         """Lookup table (1, 256); None where the first image has contrast."""
-        darkest, lightest = _extremes(image)
+        darkest, lightest = of_all = _extremes(image[::4, ::4])
+        if box is not None:
+            x, y = max(int(box[0]), 0), max(int(box[1]), 0)
+            ends = _extremes(image[y : int(box[1] + box[3]) + 1, x : int(box[0] + box[2]) + 1])
+            darkest, lightest = min(darkest, ends[0]), max(lightest, ends[1])
         if lightest - darkest < _FLAT:
             self._stretch(darkest, lightest)
+            self._span = max(of_all[1] - of_all[0], 1.0)  # where the target is in the next images is not known
 
     def stretched(self, image: Image, time: float) -> Image:
         """An image (h, w, 3) at ``time`` [s] with contrast."""
         if self.table is None:
             return image
         if time < self._fades_until:
-            darkest, lightest = _extremes(image)
+            darkest, lightest = _extremes(image[::4, ::4])
             if _FADES < (lightest - darkest) / self._span < _CUT:
                 self._stretch(darkest, lightest)
         return np.asarray(cv2.LUT(image, self.table), np.uint8)
@@ -125,7 +131,7 @@ class Contrast:
 
 
 def _extremes(image: Image) -> tuple[float, float]:
-    darkest, lightest = np.quantile(image[::4, ::4], _EXTREMES)
+    darkest, lightest = np.quantile(image, _EXTREMES)
     return float(darkest), float(lightest)
 
 

@@ -358,17 +358,36 @@ def test_a_place_is_not_followed_where_the_motion_of_the_scene_is_lost() -> None
         assert moved == (place.at(np.array([73.0, 120.0])) if known else None)
 
 
+def begun(image: Image, centre: np.ndarray) -> AppearanceTracker:
+    tracker = AppearanceTracker(SIZE, FPS)
+    tracker.begin(image, 0.0, Box(*(centre - 0.5 * TARGET), *map(float, TARGET)))
+    return tracker
+
+
 def test_a_box_that_stays_with_the_tree_before_it_goes_to_where_its_target_has_moved(
     scene: Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start = np.array([70.0, 120.0])
-    tracker = AppearanceTracker(SIZE, FPS)
-    tracker.begin(behind_a_tree(scene, start), 0.0, Box(*(start - 0.5 * TARGET), *map(float, TARGET)))
+    tracker = begun(behind_a_tree(scene, start), start)
     gone = OrientedBox(*(start - [12.0, 0.0]), *map(float, TARGET))
     monkeypatch.setattr(tracker._first_motion, "look", lambda image, seconds, scene: (gone, np.array([-30.0, 0.0])))
     found = tracker.handle_frame(behind_a_tree(scene, gone.centre), 0.4)
     assert abs(found.x - gone.x) < 4.0
     assert tracker._motion_filter.velocity[0] < -20.0
+
+
+def test_a_box_that_went_with_its_target_is_not_moved_to_a_place_that_it_passed(
+    scene: Image, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fast cars: a mark on the road, near where they were at first, was taken for them."""
+    start = np.array([70.0, 120.0])
+    tracker = begun(painted(scene, start), start)
+    tracker.box = tracker.box.at(start + [24.0, 0.0])
+    tracker.motion = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), True, 1.0)
+    mark = tracker.box.at(start + [0.0, 12.0])
+    monkeypatch.setattr(tracker._first_motion, "look", lambda image, seconds, scene: (mark, np.zeros(2)))
+    tracker._follow_first_motion(painted(scene, tracker.box.centre))
+    assert tracker.box.centre == pytest.approx(start + [24.0, 0.0])
 
 
 @pytest.mark.parametrize(("speed", "tracked", "found"), [(0.5, 0.0, True), (0.5, 0.5, False), (0.0, 0.0, False)])
@@ -418,6 +437,20 @@ def test_while_the_target_is_beyond_the_border_a_place_needs_higher_odds() -> No
         found.append(search.look(image, expected, 1.0 / FPS))
     assert found[0] is not None
     assert found[1] is None
+
+
+@pytest.mark.parametrize(("x", "gain"), [(160.0, 2.3), (-60.0, 0.0)])
+def test_an_undecided_place_becomes_likelier_as_a_search_in_view_finds_nothing_else(x: float, gain: float) -> None:
+    """A car that had braked was seen where nothing else was, for two seconds, and dropped after every eight frames."""
+    image, search, expected = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), redetection(), prediction(x)
+    place = Candidate(OrientedBox(160.0, 120.0, 30.0, 20.0), -3.0, expected.motion, 9, 5.0, 5.0)
+    search._tested = [place]
+    search._test = lambda *of: True  # type: ignore[method-assign]
+    search._search = lambda image, expected, dt: search._find_nothing(expected)  # type: ignore[method-assign]
+    for _ in range(20):
+        search.look(image, expected, 1.0 / FPS)
+    assert search._tested == [place]
+    assert place.prior == pytest.approx(-3.0 + gain, abs=0.3)
 
 
 def test_two_places_under_test_that_come_to_one_are_no_rivals() -> None:

@@ -64,6 +64,15 @@ def test_contrast_is_never_reduced_and_levels_keep_their_order(low: int) -> None
     assert Contrast(np.zeros((40, 40, 3), np.uint8), 0.0).table is not None  # nothing to see, and no division by zero
 
 
+def test_a_target_with_contrast_is_not_stretched_with_a_faint_picture() -> None:
+    """White cars on asphalt were white all over: two fifths of their pixels had the greatest level."""
+    image = np.full((40, 160, 3), 70, np.uint8)
+    image[:, ::2] = 120
+    image[10:20, 10:14] = 220
+    assert Contrast(image, 0.0).table is not None
+    assert Contrast(image, 0.0, (9.0, 9.0, 10.0, 12.0)).table is None
+
+
 @pytest.mark.parametrize("model", ["ground", "plain", "paper"])
 def test_a_target_on_a_black_image_is_refused(model: str) -> None:
     black = np.zeros((240, 320, 3), np.uint8)
