@@ -35,12 +35,13 @@ _HALVES = ((0.0, 0.5), (0.25, 0.75))
 """Of a body that is in a box, from head (0) to foot (1): boxes of upper bodies, and those of half the size."""
 _SMALLEST_M, _LARGEST_M = 0.1, 60.0  # a blackbird, a large aeroplane; in cm for m a car is 3 cm in size
 _SHIFT_S = 0.2  # within which a car at 10 m/s drives half its length
-_SHIFTS_S = _SHIFT_S * np.arange(-75, 76)
+_SHIFTS_S: Floats = _SHIFT_S * np.arange(-75.0, 76.0)
 """Lags [s] that are tried: up to what videos that are started by hand differ by."""
+_IS_GIVEN = np.abs(_SHIFTS_S) <= 2 * _SHIFT_S  # which of them are as good as none
 _MIN_IN_PLANE = 0.5
 """Share of one camera's boxes with one of the other's in the epipolar plane, at the best lag, that is no chance: with
 at most half of it at the given one, none of 17 simulated rigs with right offsets was warned of, 38 of 68 others."""
-_GROUNDS = np.arange(-4, 5) / 10.0
+_GROUNDS: Floats = np.arange(-4.0, 5.0) / 10.0
 """Heights of the ground that are tried, in people's heights from where people of 1.7 m would stand. Of the crowd it is
 0.1, by which places at 20 m are 1 m off: there all 21 pairs of cameras see the same people, elsewhere one to five."""
 _MIN_MET_THERE, _MIN_OF_BEST = 0.3, 0.5
@@ -168,7 +169,7 @@ def _shifted_clocks(messages: Sequence[pb.Observation], known: GivenCalibration)
             off = np.abs(np.einsum("nix,njx->nij", planes, candidates[at]))
             return np.asarray((off < radius[at][:, None]).any(axis=2))
 
-        pairs[a, b] = _shares(times[some], others, np.isfinite(planes[:, :, 0]), met)
+        pairs[a, b] = _shares(_SHIFTS_S, times[some], others, np.isfinite(planes[:, :, 0]), met)
     return _other_lags(pairs, "vehicles", _MIN_IN_PLANE)
 
 
@@ -179,12 +180,24 @@ def _shifted_people(messages: Sequence[pb.Observation], known: GivenCalibration,
     """
     height = PERSON.size_m / METRES_PER_UNIT[known.calibration.units]
     usual = float(np.median((bodies.centre + height * bodies.foot) @ bodies.up))
-    met = [_meetings(messages, known, bodies.up, usual + share * height) for share in _GROUNDS]
-    return _other_lags(max(met, key=lambda one: sum(map(np.max, one.values()))), "people", _MIN_MET_THERE)
+    grounds: Floats = usual + height * _GROUNDS
+
+    def most(levels: Floats, shifts: Floats) -> tuple[float, dict[tuple[str, str], Floats], float]:
+        """Of these grounds the one on which most meet: their mean share in pairs of cameras, all shares, the ground."""
+        met = [_meetings(messages, known, bodies.up, ground, shifts) for ground in levels]
+        means = [float(np.mean([one.max() for one in pairs.values() if one.any()] or [0.0])) for pairs in met]
+        best = int(np.argmax(means))
+        return means[best], met[best], float(levels[best])
+
+    ground = most(grounds, np.asarray(_SHIFTS_S[_IS_GIVEN]))[2]  # nearly always: lags are right
+    mean, met, _ = most(np.array([ground]), _SHIFTS_S)
+    if mean < _MIN_IN_PLANE:
+        met = most(grounds, _SHIFTS_S)[1]
+    return _other_lags(met, "people", _MIN_MET_THERE)
 
 
 def _meetings(
-    messages: Sequence[pb.Observation], known: GivenCalibration, up: Floats, ground: float
+    messages: Sequence[pb.Observation], known: GivenCalibration, up: Floats, ground: float, shifts: Floats
 ) -> dict[tuple[str, str], Floats]:
     """`_shares` of people who are where another camera sees somebody, by pair, on ground so far along ``up``."""
     seen = {name: _standing(one, messages, up, ground) for name, one in known.calibration.cameras.items()}
@@ -201,18 +214,18 @@ def _meetings(
             off = np.linalg.norm(here[:, None] - candidates[at], axis=2)
             return np.asarray((off < within).any(axis=1, keepdims=True))
 
-        pairs[a, b] = _shares(times[frame[some]], others, inside, met)
+        pairs[a, b] = _shares(shifts, times[frame[some]], others, inside, met)
     return pairs
 
 
-def _shares(times: Floats, others: Floats, there: Bools, met: Callable[[Ints], Bools]) -> Floats:
-    """Share at each of `_SHIFTS_S` of what is looked for in one camera's frames (n,) that another one sees; 0 of few.
+def _shares(shifts: Floats, times: Floats, others: Floats, there: Bools, met: Callable[[Ints], Bools]) -> Floats:
+    """Share at each shift [s] of what is looked for in one camera's frames (n,) that another one sees; 0 of few.
 
     times: (n,) of the frames; others: of all the other's, ascending [s]. there: (n, k) which of k things in a frame are
     looked for. met: whether they are (n, k) in these frames (n,) of the other.
     """
-    shares = np.zeros(len(_SHIFTS_S))
-    for number, shift in enumerate(_SHIFTS_S):
+    shares = np.zeros(len(shifts))
+    for number, shift in enumerate(shifts):
         wanted = times + shift
         after = np.clip(np.searchsorted(others, wanted), 1, len(others) - 1)
         nearest = after - (wanted - others[after - 1] < others[after] - wanted)
@@ -226,7 +239,7 @@ def _other_lags(pairs: Mapping[tuple[str, str], Floats], what: str, least: float
     shifted = {
         pair: float(_SHIFTS_S[np.argmax(shares)])
         for pair, shares in pairs.items()
-        if shares.max() >= least and shares[np.abs(_SHIFTS_S) <= 2 * _SHIFT_S].max() < _MIN_OF_BEST * shares.max()
+        if shares.max() >= least and shares[_IS_GIVEN].max() < _MIN_OF_BEST * shares.max()
     }
     out = []
     while shifted:
