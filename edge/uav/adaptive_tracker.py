@@ -65,6 +65,7 @@ class AdaptiveTracker:
     def begin(self, image: Image, time: float, target: Box) -> Estimate:
         """Initialise the target from its first frame. Raises InputError for an invalid box."""
         assert self._ground is not None
+        check_target_box(image, self._size, target)
         self._contrast = Contrast(image, time, (target.x, target.y, target.width, target.height))
         image = self._contrast.stretched(image, time)
         self._viewed, self._viewed_at = image, time

@@ -179,20 +179,19 @@ def _with_pairs(refusal: Refused, prepared: PreparedSession, pairs: list[PairSol
 def _from_still_parts(
     solution: Solution, observations: Observations, again: Callable[[Observations], Calibration]
 ) -> Calibration | None:
-    """The calibration without the shorter sides of jumps of clocks, or else of moves of cameras; None without either.
+    """The calibration without the shorter sides of jumps of clocks, or of moves of cameras; None without either.
 
     Also None where what is left says too little: then all rows have to do.
     """
     left_out = [name for name in solution.prepared.cameras if name in solution.refused]
-    clocks = set_clocks(left_out, observations) | unexplained_sides(solution, observations)
-    if found := _between_settings(clocks, observations, again):
+    if found := _between_settings(set_clocks(left_out, observations), observations, again):
         return found
     if moves := moved_cameras(solution, observations):
         with suppress(Refused):
             found = again(without_moved(observations, moves))
             warnings = tuple(move.warning(name) for name, move in moves.items())
             return replace(found, warnings=(*found.warnings, *warnings))
-    return None
+    return _between_settings(unexplained_sides(solution, observations), observations, again)
 
 
 def _check(

@@ -216,9 +216,8 @@ class RecordedStream:
 def session_from_messages(messages: Iterable[Message]) -> RecordedStream:
     """The session of a log's messages.
 
-    Times of arrival are not used: a log of other makers holds whatever they wrote. So a jump forward may be a pause,
-    and the calibration decides, as for a session folder. Raises Refused where there is nothing to calibrate from, and
-    InputError for rows that are no pixels of their images.
+    Times of arrival are not used: a log of other makers holds whatever they wrote. Raises Refused where there is
+    nothing to calibrate from, and InputError for rows that are no pixels of their images.
     """
     stream = ObservationStream()
     for message in messages:
@@ -226,7 +225,7 @@ def session_from_messages(messages: Iterable[Message]) -> RecordedStream:
             stream.clock_priors.handle(message)
             continue
         if isinstance(message, pb.Observation):
-            message, _ = stream.assign(message, None, backlog=True)
+            message, _ = stream.assign(message, None)
         stream.store(message)
     of_marker = stream.has_marker(LEAST_ROWS)
     by_camera = {} if of_marker else stream.several_people()

@@ -20,8 +20,9 @@ from protocols.geometry.types import Floats, Image
 _MARGIN = 1.0  # log odds by which a place must exceed the next best one, and the one under test
 _MANOEUVRE = 3.0  # acceleration of what brakes, turns or sets off, in lengths a second squared; a car that starts
 _ANYWHERE_RATE = 0.01  # at which a target is not near its prediction any more [1/s]
-_PROPOSED, _MOST_PROPOSED = 2.5, 1.0  # log likelihood ratio of another tracker's place; its log prior, at most
+_PROPOSED, _MOST_PROPOSED = 2.5, 1.0  # log likelihood ratio of another tracker's place; its first log prior, at most
 _PROMISING = 0.0  # log odds of a place under test above which others are searched about the prediction only
+_LONG_TEST = 8  # frames under test after which all of the image is searched beside: it may be a look-alike
 _WORTH_A_TEST = -8.0  # log odds on the search's coarse grid, off which the similarity is higher by far
 _MOST_TESTED, _RIVAL_MARGIN = 2, 2.0  # places that are tested at once; log odds within which one is a rival
 _UNSEARCHED = 4.0  # log odds that a place must exceed, with the margin, while the target is surely out of reach
@@ -86,7 +87,8 @@ class Redetection:
         """Search one image; the place that is taken for the target, if any: by its odds, and a margin over the next."""
         self._moving = moving
         self._tested = [c for c in self._tested if self._test(image, c, expected, dt)]
-        if not self._tested or self._tested[0].log_odds < _PROMISING or expected.frames % 2 == 0:
+        hopeful = self._tested and self._tested[0].log_odds >= _PROMISING and self._tested[0].hits <= _LONG_TEST
+        if not hopeful or expected.frames % 2 == 0:
             self._search(image, expected, dt)
         kept: list[Candidate] = []
         for candidate in sorted(self._tested, key=lambda c: -c.log_odds):

@@ -26,25 +26,24 @@ _LEAST_EXPLAINED = 0.5
 """Share of inliers in a part, over that of the camera's best part, below which its clock is another one. In simulated
 worlds pauses left at least 0.97, clocks set by 0.5 s and more 0 to 0.21; where they left more, other tests of clocks
 and moves found them."""
+_MOVED = ", or it paused and was moved"  # of a jump forward
 
 
 @dataclass(frozen=True, slots=True)
 class SetClock:
-    """A camera's frames (n,) that are used, between jumps of its clock, the largest of which is ``size`` [s].
-    others: how many of its frames are left out. is_known: no pause explains it."""
+    """First and last frames of the parts of a camera's that are used, between jumps of its clock, the largest of which
+    is ``size`` [s]. others: how many of its frames are left out. or_else: what else explains it."""
 
-    frames: Ints
+    parts: tuple[tuple[int, int], ...]
     size: float
     others: int
-    is_known: bool = True
+    or_else: str = ""
 
     def warning(self, name: str) -> str:
         """One sentence for a person."""
-        jump = f"its clock was set by about {self.size:+.1f} s while its frames were counted"
-        if not self.is_known:
-            jump += ", or it paused and no other camera saw what it saw then"
-        frames = f"only frames {self.frames[0]} to {self.frames[-1]} were used, {self.others} others left out"
-        return f"{name}: {jump}: {frames}"
+        jump = f"its clock was set by about {self.size:+.1f} s while its frames were counted{self.or_else}"
+        frames = ", ".join(f"{first} to {last}" for first, last in self.parts)
+        return f"{name}: {jump}: only frames {frames} were used, {self.others} others left out"
 
 
 def set_clocks(names: Iterable[str], observations: Observations) -> dict[str, SetClock]:
@@ -57,7 +56,8 @@ def set_clocks(names: Iterable[str], observations: Observations) -> dict[str, Se
             ends = ends[np.diff(time)[ends] < 0.0]
         if 0 < len(ends) <= _MOST_SETTINGS:
             kept = max(np.split(frame, ends + 1), key=len)
-            out[name] = SetClock(kept, _largest(jumps[ends]), len(frame) - len(kept))
+            size, ranges = _largest(jumps[ends]), ((int(kept[0]), int(kept[-1])),)
+            out[name] = SetClock(ranges, size, len(frame) - len(kept), _MOVED if size > 0.0 else "")
     return out
 
 
@@ -74,13 +74,16 @@ def unexplained_sides(solution: Solution, observations: Observations) -> dict[st
         between = np.array([(stamp >= at[0]) & (stamp <= at[-1]) for _, at in parts])
         between &= between.sum(axis=0) == 1  # a clock set back shows some times twice
         known = np.array([np.count_nonzero(is_known[mine]) for mine in between])
-        shares = np.array([used[mine].sum() for mine in between]) / np.maximum(known, LEAST_ROWS)
+        shares = np.array([used[mine].sum() for mine in between]) / np.maximum(known, 1)
         is_good = (shares >= _LEAST_EXPLAINED * shares.max()) | [len(of) < LEAST_ROWS for of, _ in parts]
         borders = ends[is_good[1:] != is_good[:-1]]
         if len(borders):
-            kept = np.concatenate([of for (of, _), good in zip(parts, is_good, strict=True) if good])
-            others, is_set = len(frame) - len(kept), bool((known[~is_good] >= LEAST_ROWS).all())
-            out[name] = SetClock(kept, _largest(jumps[borders]), others, is_set)
+            kept = [of for (of, _), good in zip(parts, is_good, strict=True) if good]
+            others, size = len(frame) - sum(map(len, kept)), _largest(jumps[borders])
+            ranges = tuple((int(of[0]), int(of[-1])) for of in kept)
+            moved = bool((known[~is_good] >= LEAST_ROWS).all())
+            paused = _MOVED if moved else ", or it paused and no other camera saw what it saw then"
+            out[name] = SetClock(ranges, size, others, paused if size > 0.0 else "")
     return out
 
 
@@ -89,7 +92,8 @@ def between_settings(observations: Observations, clocks: Mapping[str, SetClock])
     tracks = dict(observations.tracks)
     for key, track in observations.tracks.items():
         if clock := clocks.get(key[0]):
-            tracks[key] = track.select(np.isin(track.frame, clock.frames))
+            inside = [(track.frame >= first) & (track.frame <= last) for first, last in clock.parts]
+            tracks[key] = track.select(np.any(inside, axis=0))
     return replace(observations, tracks={key: track for key, track in tracks.items() if len(track)})
 
 

@@ -6,14 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from google.protobuf.message import Message
 
 from hub.calibration.pipeline import calibrate
-from hub.calibration.resection.set_clocks import set_clocks
-from hub.clocks.observation_stream import session_from_messages
+from hub.calibration.resection.set_clocks import SetClock, set_clocks
 from protocols.session.observations import Observations, gather_tracks
 from tests.support import rigs
-from tests.support.session_messages import info_messages, row_messages
 
 SECONDS = 30.0
 
@@ -49,29 +46,36 @@ def test_a_camera_that_is_placed_by_its_rows_on_one_side_says_so(size: float, at
     assert abs(session.clock_error("cam2", found.reference, time_map) + late) < 1e-3
 
 
-def _with_frames_lost(session: rigs.Session, camera: str, *begins: float) -> list[Message]:
-    """The session's messages without the frames of 0.5 s from these times on, which the camera does not count."""
-    lost = np.zeros(len(session.time), np.bool_)
-    frame, shown = session.frame.copy(), session.time - session.time[session.of_camera(camera)][0]
-    for begin in begins:
-        mine = session.of_camera(camera) & (shown >= begin)
-        lost |= mine & (shown < begin + 0.5)
-        frame[mine] -= int((session.of_camera(camera) & (shown < begin + 0.5) & (shown >= begin)).sum())
-    kept, counted = [int(i) for i in np.flatnonzero(~lost)], replace(session, frame=frame)
-    boot = lambda name: "b"  # noqa: E731
-    rows = row_messages(counted, boot, kept, lambda i: float(session.time[i]))
-    return [*info_messages(session, boot), *rows]
+@pytest.mark.parametrize(("at", "turn"), [(26.0, 0.02), (34.0, 0.1), (26.0, 0.1)])
+def test_a_camera_that_was_turned_while_it_paused_was_moved(at: float, turn: float) -> None:
+    """Its frames are not counted while it pauses: the rows after it are those of another pose, not of another clock."""
+    session = rigs.simulate(41, 4, 40.0).turned("cam2", at, turn)
+    mine = session.of_camera("cam2")
+    lost = mine & (session.true > at) & (session.true < at + 2.0)
+    frame = session.frame.copy()
+    frame[mine & (session.true >= at + 2.0)] -= len(np.unique(frame[lost]))
+    found = calibrate(session.rig, replace(session, frame=frame).where(~lost).observations(), thorough=True)
+    assert ["cam2" in text and "moved" in text for text in found.warnings] == [True]
 
 
-def test_frames_that_a_camera_lost_and_did_not_count_are_no_step_of_its_clock_in_a_log() -> None:
-    """The longest part between two of them was used of the camera, and the others were of "other boots"."""
-    session = rigs.simulate(44, 3, SECONDS)
-    recorded = session_from_messages(_with_frames_lost(session, "cam1", 8.0, 16.0, 23.0))
-    assert recorded.warnings == ()
-    found = calibrate(recorded.rig, recorded.observations, thorough=True)
+def test_the_few_rows_that_are_known_after_a_pause_are_used() -> None:
+    session = rigs.simulate(43, 4, 40.0)
+    mine = session.of_camera("cam2")
+    lost, away = (session.true > 24.0) & (session.true < 30.0), (session.true > 30.4) & ~mine
+    frame = session.frame.copy()
+    frame[mine & (session.true >= 30.0)] -= len(np.unique(frame[mine & lost]))
+    seen = replace(session, frame=frame).where(~(mine & lost) & ~away).observations()
+    found = calibrate(session.rig, seen, thorough=True)
     assert found.warnings == ()
-    assert len(found.residuals["cam1"]) > 0.9 * len(recorded.observations.of_camera("cam1")[0])
-    assert np.ptp(found.residuals["cam1"][:, 0]) > 0.9 * SECONDS
+    assert np.ptp(found.residuals["cam2"][:, 0]) > 29.5
+
+
+def test_a_part_in_the_middle_that_is_left_out_is_named() -> None:
+    assert (
+        SetClock(((0, 399), (700, 958)), 3.0, 300)
+        .warning("cam1")
+        .endswith("only frames 0 to 399, 700 to 958 were used, 300 others left out")
+    )
 
 
 def test_pauses_shuffled_rows_and_even_clocks_are_no_settings() -> None:
