@@ -453,6 +453,21 @@ def test_an_undecided_place_becomes_likelier_as_a_search_in_view_finds_nothing_e
     assert place.prior == pytest.approx(-3.0 + gain, abs=0.3)
 
 
+@pytest.mark.parametrize(("hits", "searched"), [(2, 4), (9, 8)])
+def test_all_of_the_image_is_searched_beside_a_place_that_stays_undecided(hits: int, searched: int) -> None:
+    image, search, count = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), redetection(), [0]
+    search._tested = [Candidate(OrientedBox(160.0, 120.0, 30.0, 20.0), -3.0, prediction(160.0).motion, hits, 5.0, 5.0)]
+    search._test = lambda *of: True  # type: ignore[method-assign]
+
+    def one(*of: object) -> None:
+        count[0] += 1
+
+    search._search = one  # type: ignore[method-assign]
+    for frame in range(8):
+        search.look(image, replace(prediction(160.0), frames=frame), 1.0 / FPS)
+    assert count[0] == searched
+
+
 def test_two_places_under_test_that_come_to_one_are_no_rivals() -> None:
     """Both had settled on the target: neither had a margin over the other for a second and a half."""
     search, expected = redetection(), prediction(160.0)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from edge.uav.adaptive_tracker import AdaptiveTracker
 from edge.uav.base import Box, Tracker, TrackState
 from edge.uav.baselines import histograms, regions, road
 from edge.uav.baselines.background import BackgroundFilter, BackgroundMotion, predicted_flow
@@ -273,7 +274,7 @@ def test_the_same_seed_gives_the_same_track() -> None:
     assert _flight(PaperTracker(SIZE, seed=3), 6, 3)[1] == _flight(PaperTracker(SIZE, seed=3), 6, 3)[1]
 
 
-@pytest.mark.parametrize("tracker", [PlainTracker, PaperTracker])
+@pytest.mark.parametrize("tracker", [PlainTracker, PaperTracker, AdaptiveTracker])
 @pytest.mark.parametrize(
     "box",
     [
@@ -283,7 +284,9 @@ def test_the_same_seed_gives_the_same_track() -> None:
         Box(1.0, 1.0, -5.0, 9.0),
     ],
 )
-def test_an_invalid_box_is_refused(tracker: type[PlainTracker] | type[PaperTracker], box: Box) -> None:
+def test_an_invalid_box_is_refused(
+    tracker: type[PlainTracker] | type[PaperTracker] | type[AdaptiveTracker], box: Box
+) -> None:
     with pytest.raises(InputError):
         tracker(SIZE).begin(camera_image(300.0, 320.0), 0.0, box)
 
