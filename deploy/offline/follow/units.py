@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from deploy.offline.follow.lags import (
+    FRAMES,
+    MIN_LOOKED_AT,
+    SAME_TIME_NS,
+    WITHIN,
+    shifted_people,
+    shifted_vehicles,
+)
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.target_models import PERSON
 from protocols.core.errors import InputError
@@ -34,34 +40,13 @@ _PIXELS = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 1.5, 2.0, 3.0)
 _HALVES = ((0.0, 0.5), (0.25, 0.75))
 """Of a body that is in a box, from head (0) to foot (1): boxes of upper bodies, and those of half the size."""
 _SMALLEST_M, _LARGEST_M = 0.1, 60.0  # a blackbird, a large aeroplane; in cm for m a car is 3 cm in size
-_SHIFT_S = 0.2  # within which a car at 10 m/s drives half its length
-_SHIFTS_S: Floats = _SHIFT_S * np.arange(-75.0, 76.0)
-"""Lags [s] that are tried: up to what videos that are started by hand differ by."""
-_IS_GIVEN = np.abs(_SHIFTS_S) <= 2 * _SHIFT_S  # which of them are as good as none
-_MIN_IN_PLANE = 0.5
-"""Share of one camera's boxes with one of the other's in the epipolar plane, at the best lag, that is no chance: with
-at most half of it at the given one, none of 17 simulated rigs with right offsets was warned of, 38 of 68 others."""
-_GROUNDS: Floats = np.arange(-4.0, 5.0) / 10.0
-"""Heights of the ground that are tried, in people's heights from where people of 1.7 m would stand. Of the crowd it is
-0.1, by which places at 20 m are 1 m off: there all 21 pairs of cameras see the same people, elsewhere one to five."""
-_MIN_MET_THERE, _MIN_OF_BEST = 0.3, 0.5
-"""Share of people of one camera who are where another one sees somebody, at the best lag, that is no chance; and the
-share of that at the given lag from which on this is right. Of 30 recordings of simulated
-rooms with right clocks, and right or wrong poses, lenses and scales, none was warned of; with a clock 1.5 s off five of
-six rooms."""
-_FRAMES = 60
-"""Frames that are looked at, spread over the session: some hundred people."""
-_WITHIN = 0.35
-"""Distance, as a share of a person's height, within which the feet that two cameras see are one person's: 0.6 m, which
-somebody walks between two frames 0.4 s apart."""
-_SAME_TIME_NS = 250_000_000  # a camera at 2 Hz has a frame as near as this to every chosen moment
 _MIN_SHARE, _CLEARLY = 0.2, 4.0
 """Least share of people whom two cameras see at one place, and how many times the share in the stated units it must be.
 In the crowd of seven cameras the share is 0.42 in metres, and at most 0.11, by chance, in any other of these units."""
 _UPRIGHT = 0.7  # cosine of 45°: nobody upright leans as much
-_MIN_LOOKED_AT, _MIN_MET = 30, 0.1
-"""People at places where another camera looks, and the share that it sees there, below which a warning is given: 0.42
-in that crowd and 0.78 in a simulated room, at most 0.06 with the pixels of pictures that were squeezed into squares."""
+_MIN_MET = 0.1
+"""Share of the people at places where another camera looks that it sees there, below which a warning is given: 0.42 in
+that crowd and 0.78 in a simulated room, at most 0.06 with the pixels of pictures that were squeezed into squares."""
 _SMALL, _MIN_MET_SMALL = (0.55, 0.6, 0.65, 0.7, 0.75, 0.8), 0.3
 """Heights over an adult's, and the share that meets at one of them: 0.68 and 0.36 of seated people and children of 1 m;
 up to 0.1 of pictures that were squeezed across, but 0.5 of those squeezed along the bodies."""
@@ -107,7 +92,7 @@ def check_units(
     an arbitrary scale nothing is checked.
     """
     if kind != "person":
-        return _shifted_clocks(messages, known)
+        return shifted_vehicles(messages, known)
     _refuse_wide(messages, known, session)
     if known.calibration.scale != "metric":
         return ()
@@ -128,7 +113,8 @@ def check_units(
         _crossed(bodies[best], _MISTAKES[best].lengths * height) <= _crossed(bodies[0], height)
     ):
         nowhere = _nowhere(bodies[0], [known.calibration.cameras[name] for name in people], height)
-        return nowhere or _shifted_people(messages, known, bodies[0])
+        ground = float(np.median((bodies[0].centre + height * bodies[0].foot) @ bodies[0].up))
+        return nowhere or shifted_people(messages, known, bodies[0].up, ground)
     raise _refusal(_MISTAKES[best], bodies[best].up, known, session)
 
 
@@ -142,7 +128,7 @@ def unlikely_size(
     sizes = []
     for track in tracks:
         place = np.median(track.position, axis=0)  # a path is short beside the factor 10 to either limit
-        for name, sequence, index in track.detections[:: 1 + len(track.detections) // _FRAMES]:
+        for name, sequence, index in track.detections[:: 1 + len(track.detections) // FRAMES]:
             camera, box = known.calibration.cameras[name], boxes[name, sequence][index].box
             if len(box) == 4:
                 distance = float(np.linalg.norm(place - camera.pose.position))
@@ -151,154 +137,6 @@ def unlikely_size(
     if _SMALLEST_M < metres < _LARGEST_M:
         return ()
     return (f"what is followed is about {metres:.2g} m in size: are the calibration's positions in its units?",)
-
-
-def _shifted_clocks(messages: Sequence[pb.Observation], known: GivenCalibration) -> tuple[str, ...]:
-    """A warning where vehicles of two cameras lie in one epipolar plane far more often at another lag."""
-    seen = {name: _vehicle_rays(camera, messages) for name, camera in known.calibration.cameras.items()}
-    pairs = dict[tuple[str, str], Floats]()
-    for a, b in combinations([name for name, (times, *_) in seen.items() if len(times)], 2):
-        times, rays, _ = seen[a]
-        others, candidates, radius = seen[b]
-        some = np.unique(np.linspace(0, len(times) - 1, 2 * _FRAMES).astype(int))
-        places = [known.calibration.cameras[name].pose.position for name in (a, b)]
-        planes = np.cross(places[1] - places[0], rays[some])
-        planes /= np.maximum(np.linalg.norm(planes, axis=2, keepdims=True), 1e-300)
-
-        def met(at: Ints, planes: Floats = planes, candidates: Floats = candidates, radius: Floats = radius) -> Bools:
-            off = np.abs(np.einsum("nix,njx->nij", planes, candidates[at]))
-            return np.asarray((off < radius[at][:, None]).any(axis=2))
-
-        pairs[a, b] = _shares(_SHIFTS_S, times[some], others, np.isfinite(planes[:, :, 0]), met)
-    return _other_lags(pairs, "vehicles", _MIN_IN_PLANE)
-
-
-def _shifted_people(messages: Sequence[pb.Observation], known: GivenCalibration, bodies: _Bodies) -> tuple[str, ...]:
-    """A warning where people of two cameras stand at one place far more often at another lag.
-
-    On level ground, where most meet at the best lags: people's mean height does not tell it well enough.
-    """
-    height = PERSON.size_m / METRES_PER_UNIT[known.calibration.units]
-    usual = float(np.median((bodies.centre + height * bodies.foot) @ bodies.up))
-    grounds: Floats = usual + height * _GROUNDS
-
-    def most(levels: Floats, shifts: Floats) -> tuple[float, dict[tuple[str, str], Floats], float]:
-        """Of these grounds the one on which most meet: their mean share in pairs of cameras, all shares, the ground."""
-        met = [_meetings(messages, known, bodies.up, ground, shifts) for ground in levels]
-        means = [float(np.mean([one.max() for one in pairs.values() if one.any()] or [0.0])) for pairs in met]
-        best = int(np.argmax(means))
-        return means[best], met[best], float(levels[best])
-
-    ground = most(grounds, np.asarray(_SHIFTS_S[_IS_GIVEN]))[2]  # nearly always: lags are right
-    mean, met, _ = most(np.array([ground]), _SHIFTS_S)
-    if mean < _MIN_IN_PLANE:
-        met = most(grounds, _SHIFTS_S)[1]
-    return _other_lags(met, "people", _MIN_MET_THERE)
-
-
-def _meetings(
-    messages: Sequence[pb.Observation], known: GivenCalibration, up: Floats, ground: float, shifts: Floats
-) -> dict[tuple[str, str], Floats]:
-    """`_shares` of people who are where another camera sees somebody, by pair, on ground so far along ``up``."""
-    seen = {name: _standing(one, messages, up, ground) for name, one in known.calibration.cameras.items()}
-    pairs, within = dict[tuple[str, str], Floats](), _WITHIN * PERSON.size_m / METRES_PER_UNIT[known.calibration.units]
-    for a, b in combinations([name for name, (times, _) in seen.items() if len(times) > 1], 2):
-        (times, places), (others, candidates), camera = seen[a], seen[b], known.calibration.cameras[b]
-        frame, place = np.nonzero(np.isfinite(places[:, :, 0]))
-        some = np.unique(np.linspace(0, len(frame) - 1, 2 * _FRAMES).astype(int)) if len(frame) else frame
-        here, lens = places[frame[some], place[some]], camera.intrinsics
-        pixel = lens.project(camera.pose.camera_from_world(here))
-        inside = np.all((pixel > 0.0) & (pixel < [lens.width, lens.height]), axis=1, keepdims=True)
-
-        def met(at: Ints, here: Floats = here, candidates: Floats = candidates) -> Bools:
-            off = np.linalg.norm(here[:, None] - candidates[at], axis=2)
-            return np.asarray((off < within).any(axis=1, keepdims=True))
-
-        pairs[a, b] = _shares(shifts, times[frame[some]], others, inside, met)
-    return pairs
-
-
-def _shares(shifts: Floats, times: Floats, others: Floats, there: Bools, met: Callable[[Ints], Bools]) -> Floats:
-    """Share at each shift [s] of what is looked for in one camera's frames (n,) that another one sees; 0 of few.
-
-    times: (n,) of the frames; others: of all the other's, ascending [s]. there: (n, k) which of k things in a frame are
-    looked for. met: whether they are (n, k) in these frames (n,) of the other.
-    """
-    shares = np.zeros(len(shifts))
-    for number, shift in enumerate(shifts):
-        wanted = times + shift
-        after = np.clip(np.searchsorted(others, wanted), 1, len(others) - 1)
-        nearest = after - (wanted - others[after - 1] < others[after] - wanted)
-        near = there & (np.abs(others[nearest] - wanted) * 1e9 <= _SAME_TIME_NS)[:, None]
-        shares[number] = (met(nearest) & near).sum() / near.sum() if near.sum() >= _MIN_LOOKED_AT else 0.0
-    return shares
-
-
-def _other_lags(pairs: Mapping[tuple[str, str], Floats], what: str, least: float) -> tuple[str, ...]:
-    """A warning for each camera that fits others far better at another lag, in a share of ``least`` or more."""
-    shifted = {
-        pair: float(_SHIFTS_S[np.argmax(shares)])
-        for pair, shares in pairs.items()
-        if shares.max() >= least and shares[_IS_GIVEN].max() < _MIN_OF_BEST * shares.max()
-    }
-    out = []
-    while shifted:
-        count = Counter(name for pair in reversed(shifted) for name in reversed(pair))
-        name = count.most_common(1)[0][0]
-        mine = {pair: shift if name == pair[0] else -shift for pair, shift in shifted.items() if name in pair}
-        others = ", ".join(other for pair in mine for other in pair if other != name)
-        out.append(
-            f"{name}: its {what} fit those of {others} with about {np.median(list(mine.values())):+.1f} s added to its "
-            "time_offset: is the calibration of this recording?"
-        )
-        shifted = {pair: shift for pair, shift in shifted.items() if name not in pair}
-    return tuple(out)
-
-
-def _standing(
-    camera: CameraCalibration, messages: Sequence[pb.Observation], up: Floats, ground: float
-) -> tuple[Floats, Floats]:
-    """Reference times (n,) [s] of a camera's frames with people, and where these stand (n, k, 3) on level ground that
-    lies so far along ``up``; NaN where a frame has fewer."""
-    tracked = TrackingCamera.from_calibration(camera)
-    frames = sorted(
-        (tracked.reference_ns(one.device_time_ns) * 1e-9, feet)
-        for one in messages
-        if one.camera == camera.name and (feet := [(*d.foot,) for d in one.detections if d.head and d.foot])
-    )
-    counts = np.array([len(feet) for _, feet in frames], dtype=np.int64)
-    places = np.full((len(frames), max(counts, default=0), 3), np.nan)
-    if frames:
-        rays = camera.intrinsics.unproject(np.concatenate([feet for _, feet in frames]))
-        foot = np.hstack([rays, np.ones((len(rays), 1))]) @ camera.pose.rotation
-        with np.errstate(divide="ignore", invalid="ignore"):
-            away = (ground - camera.pose.position @ up) / (foot @ up)
-        away[~(away > 0.0)] = np.nan
-        places[np.arange(places.shape[1]) < counts[:, None]] = camera.pose.position + away[:, None] * foot
-    return np.array([time for time, _ in frames]), places
-
-
-def _vehicle_rays(camera: CameraCalibration, messages: Sequence[pb.Observation]) -> tuple[Floats, Floats, Floats]:
-    """Of n frames with boxes: reference times (n,) [s], directions in the world to k boxes (n, k, 3), NaN where a frame
-    has fewer, and half the boxes' sizes (n, k) [rad]."""
-    frames = [one for one in messages if one.camera == camera.name and any(len(d.box) == 4 for d in one.detections)]
-    tracked = TrackingCamera.from_calibration(camera)
-    times = np.array([tracked.reference_ns(one.device_time_ns) * 1e-9 for one in frames])
-    frames, times = [frames[i] for i in np.argsort(times, kind="stable")], np.sort(times)
-    if len(frames) < 2:
-        return np.zeros(0), np.zeros((0, 0, 3)), np.zeros((0, 0))
-    most = max(len(one.detections) for one in frames)
-    boxes = np.full((len(frames), most, 4), np.nan)
-    for row, one in zip(boxes, frames, strict=True):
-        found = [list(d.box) for d in one.detections if len(d.box) == 4]
-        row[: len(found)] = found
-    middle = (boxes[:, :, :2] + 0.5 * boxes[:, :, 2:]).reshape(-1, 2)
-    given = np.isfinite(middle[:, 0])
-    rays = np.full((len(middle), 3), np.nan)
-    rays[given] = np.column_stack([camera.intrinsics.unproject(middle[given]), np.ones(given.sum())])
-    rays = rays @ camera.pose.rotation / np.linalg.norm(rays, axis=1, keepdims=True)
-    radius = 0.5 * np.sqrt(boxes[:, :, 2] * boxes[:, :, 3]) / camera.intrinsics.focal
-    return times, rays.reshape(len(frames), most, 3), radius
 
 
 def boxes_from_above(messages: Sequence[pb.Observation], known: GivenCalibration) -> str:
@@ -323,7 +161,7 @@ def _refuse_wide(messages: Sequence[pb.Observation], known: GivenCalibration, se
         if known.up is not None and -(camera.pose.rotation @ known.up)[1] > _UPRIGHT
     }
     boxes = [d.box for message in messages if message.camera in standing for d in message.detections if d.box]
-    if len(boxes) >= _MIN_LOOKED_AT and np.median([box[2] / box[3] for box in boxes]) > _WIDE:
+    if len(boxes) >= MIN_LOOKED_AT and np.median([box[2] / box[3] for box in boxes]) > _WIDE:
         remedy = "swap width and height, or give boxes of people who stand"
         raise InputError("most boxes are wider than high: they are of no upright people", file=session, remedy=remedy)
 
@@ -381,8 +219,8 @@ def _people(messages: Sequence[pb.Observation], known: GivenCalibration) -> dict
     tracked = {name: TrackingCamera.from_calibration(camera) for name, camera in known.calibration.cameras.items()}
     stamps = np.array([tracked[message.camera].reference_ns(message.device_time_ns) for message in messages])
     moments = np.unique(stamps)
-    chosen = moments[np.linspace(0, len(moments) - 1, min(_FRAMES, len(moments))).astype(int)]
-    wanted = np.abs(stamps[:, None] - chosen).min(axis=1) <= _SAME_TIME_NS
+    chosen = moments[np.linspace(0, len(moments) - 1, min(FRAMES, len(moments))).astype(int)]
+    wanted = np.abs(stamps[:, None] - chosen).min(axis=1) <= SAME_TIME_NS
     found: dict[str, list[tuple[float, ...]]] = {}
     for at in np.flatnonzero(wanted).tolist():
         found.setdefault(messages[at].camera, []).extend(
@@ -419,10 +257,10 @@ def _bodies(people: Mapping[str, Floats], known: GivenCalibration, wrong: _Mista
 def _met(bodies: _Bodies, height: float) -> Bools:
     """Whether another camera sees somebody at a person's place (n,), if people are of this height."""
     # Frames of other times are put far away.
-    apart = bodies.time[:, None] / _SAME_TIME_NS * _WITHIN * height
+    apart = bodies.time[:, None] / SAME_TIME_NS * WITHIN * height
     place = np.hstack([bodies.centre + height * bodies.foot, apart])
     met = np.zeros(len(place), dtype=np.bool_)
-    pairs = cKDTree(place).query_pairs(_WITHIN * height, output_type="ndarray")
+    pairs = cKDTree(place).query_pairs(WITHIN * height, output_type="ndarray")
     met[pairs[bodies.owner[pairs[:, 0]] != bodies.owner[pairs[:, 1]]].ravel()] = True
     return met
 
@@ -431,7 +269,7 @@ def _crossed(bodies: _Bodies, height: float) -> float:
     """The share of people at whose feet the ray of another camera's person passes, at the distance that both people's
     heights give within a factor: where cameras are high or far, no camera alone gives a place."""
     first = np.sort(bodies.time)[:_MOST_CROSSED]
-    pairs = cKDTree(first[:, None]).query_pairs(0.5 * _SAME_TIME_NS, output_type="ndarray")
+    pairs = cKDTree(first[:, None]).query_pairs(0.5 * SAME_TIME_NS, output_type="ndarray")
     pairs = np.argsort(bodies.time, kind="stable")[pairs]
     one, other = pairs[bodies.owner[pairs[:, 0]] != bodies.owner[pairs[:, 1]]].T
     u, v, between = bodies.foot[one], bodies.foot[other], bodies.centre[one] - bodies.centre[other]
@@ -439,7 +277,7 @@ def _crossed(bodies: _Bodies, height: float) -> float:
     with np.errstate(divide="ignore", invalid="ignore"):
         scales = np.stack([uv * vb - vv * ub, uu * vb - uv * ub]) / (uu * vv - uv**2)
         missed = np.linalg.norm(between + scales[0, :, None] * u - scales[1, :, None] * v, axis=1)
-    near = (missed < _WITHIN * height) & (np.abs(np.log(np.maximum(scales, 1e-9) / height)) < _SCALE).all(axis=0)
+    near = (missed < WITHIN * height) & (np.abs(np.log(np.maximum(scales, 1e-9) / height)) < _SCALE).all(axis=0)
     return len(np.union1d(one[near], other[near])) / max(len(first), 1)
 
 
@@ -456,12 +294,12 @@ def _nowhere(bodies: _Bodies, cameras: Sequence[CameraCalibration], height: floa
         off, _ = cKDTree(np.unique(bodies.time[mine])[:, None]).query(bodies.time[:, None], p=1)
         pixel = camera.intrinsics.project(camera.pose.camera_from_world(place))
         inside = ((pixel > 0.0) & (pixel < [camera.intrinsics.width, camera.intrinsics.height])).all(axis=1)
-        looked_at |= inside & (off <= _SAME_TIME_NS) & ~mine
+        looked_at |= inside & (off <= SAME_TIME_NS) & ~mine
     everybody = int((looked_at & (distance * _LENGTH_STD < _MAX_ERROR)).sum())
     looked_at &= known
     count, met = int(looked_at.sum()), int((_met(bodies, height) & looked_at).sum())
     # Where hardly anybody can be placed for the steep view, as below cameras at 12 m, the few are false boxes.
-    if count < max(_MIN_LOOKED_AT, _MIN_SHARE * everybody) or met >= _MIN_MET * count:
+    if count < max(MIN_LOOKED_AT, _MIN_SHARE * everybody) or met >= _MIN_MET * count:
         return ()
     small = {share: int((_met(bodies, share * height) & looked_at).sum()) for share in _SMALL}
     share = max(small, key=lambda one: small[one])
