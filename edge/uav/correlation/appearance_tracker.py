@@ -194,11 +194,12 @@ class AppearanceTracker:
         self._support = box.centre if found else None
         if self._missed and found:
             turn = expected.heading - self._heading
-            box = box.turned(turn if np.isfinite(turn) else 0.0)
+            turn = turn if np.isfinite(turn) else 0.0
+            box = box.turned(turn)
             if self._searching:
                 self._redetection.propose(box, self._prediction())
             else:
-                self.box = box
+                self.box, self._heading = box, self._heading + turn  # by which it has been turned now
         elif self._missed or not self.motion.trusted:
             # One that jumps over the scene has lost it, if most of the scene moves alike.
             clear = self.motion.trusted and self.motion.share > _MOST_OF_SCENE

@@ -290,6 +290,18 @@ def test_what_another_tracker_finds_is_not_the_target_where_it_looks_otherwise(s
     assert not any(e.state is TrackState.VISIBLE for e in follow_with_another(images, truth, 0.0)[30:])
 
 
+def test_a_hidden_target_turns_once_by_what_another_tracker_says_it_has_turned(scene: Image) -> None:
+    images, _ = flight(scene, shown_again=False)  # from the 40th on
+    tracker = AppearanceTracker(SIZE, FPS)
+    tracker.begin(images[0], 0.0, Box(160.0 - TARGET[0] / 2, 120.0 - TARGET[1] / 2, *map(float, TARGET)))
+    for k in range(1, 46):
+        heading = 0.0 if k < 42 else 0.3
+        tracker.expect(Estimate(k / FPS, TrackState.VISIBLE, 160.0 + 0.5 * k, 120.0, 34.0, 22.0, heading, 2.0))
+        tracker.handle_frame(images[k], k / FPS)
+    assert not tracker.sees
+    assert tracker.box.angle == pytest.approx(0.3, abs=0.05)
+
+
 def test_zoom_and_turn_of_an_oblique_flight_are_measured_among_moving_cars() -> None:
     world = ObliqueWorld("car", "zoom", seed=4, frames=12, fps=15.0)
     motion = SceneMotion(world.size)
