@@ -60,7 +60,8 @@ _MAX_GAP = 1.0  # s: the trajectory is split where no camera saw the point for l
 class CameraInput:
     """Input of the reconstruction for one camera. tracks: by label. lens_prior: prior of a lens that was not measured,
     or whose focal length has a std. readout_given: whether its readout was given, so that its times are already
-    corrected. stated_std: the median of the stds [px] that the detector states for its rows; 0 without any."""
+    corrected. stated_std: the median of the stds [px] that the detector states for its rows; 0 without any.
+    least_spacing: of the knots of paths [s]."""
 
     name: str
     intrinsics: Intrinsics
@@ -68,6 +69,7 @@ class CameraInput:
     lens_prior: LensPrior | None = None
     readout_given: bool = False
     stated_std: float = 0.0
+    least_spacing: float = _MIN_KNOT_SPACING
 
 
 @dataclass(slots=True, eq=False)
@@ -325,7 +327,7 @@ def knot_spacing(cameras: list[CameraInput], label: str, large: bool = False) ->
     many = not large and sum(map(_tracks_at_once, seeing)) > _MANY_TRACKS
     if (most < _FEW_FRAMES_PER_KNOT or many) and 0.5 * spacing * sum(rates) > _MANY_ROWS:
         spacing *= 0.5
-    return float(np.clip(spacing, _MIN_KNOT_SPACING, _MAX_KNOT_SPACING))
+    return float(np.clip(spacing, max(camera.least_spacing for camera in seeing), _MAX_KNOT_SPACING))
 
 
 def _tracks_at_once(camera: CameraInput) -> float:

@@ -93,6 +93,8 @@ def test_a_path_of_few_frames_a_knot_has_denser_knots(fps: float, share: float) 
     assert knot_spacing(cameras[:2], "joint") == track.basis.spacing  # two have too few rows for so many knots
     body = [replace(camera, tracks=dict.fromkeys(["joint", *"0123456"], track)) for camera in cameras]
     assert knot_spacing(body, "joint") == 0.5 * track.basis.spacing  # what the path does not follow, all joints do
+    slow = [replace(camera, least_spacing=0.28) for camera in body]
+    assert knot_spacing(slow, "joint") == 0.28  # nor do errors that last so long pass for motion
 
 
 def test_while_a_large_network_grows_only_new_cameras_are_adjusted() -> None:
