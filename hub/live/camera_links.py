@@ -26,14 +26,15 @@ class CameraLinks:
     """The links of all cameras.
 
     last_frame: hub time [s]. delays: arrival of the newest frame on the hub's clock less its time on the camera's [s];
-    camera_time: that time. fresh: cameras whose frames have not all waited for this hub: their delays are those of the
-    network. faults: errors that a camera's messages raised; notices: why it is left out.
+    camera_time: that time; boots: of the newest frames. fresh: cameras whose frames have not all waited for this hub:
+    their delays are those of the network. faults: errors that a camera's messages raised; notices: why it is left out.
     """
 
     def __init__(self) -> None:
         self.last_frame: dict[str, float] = {}
         self.delays: dict[str, float] = {}
         self.camera_time: dict[str, float] = {}
+        self.boots: dict[str, str] = {}
         self.fresh: set[str] = set()
         self.faults: Counter[str] = Counter()
         self.notices: dict[str, str] = {}
@@ -45,8 +46,9 @@ class CameraLinks:
 
     def forget(self, camera: str) -> None:
         """Forget a camera, as if it had never been heard of."""
-        for of_camera in (self.last_frame, self.delays, self.camera_time, self.notices, self.standing, self._windows):
+        for of_camera in (self.last_frame, self.delays, self.camera_time, self.boots, self.notices, self.standing):
             of_camera.pop(camera, None)
+        self._windows.pop(camera, None)
         self.fresh.discard(camera)
 
     def receive(self, message: pb.Observation, now: float, arrival: float | None, *, backlog: bool) -> None:
@@ -57,7 +59,7 @@ class CameraLinks:
             if not backlog:
                 self.fresh.add(camera)
             self.delays[camera] = arrival - camera_time
-        self.last_frame[camera] = now
+        self.last_frame[camera], self.boots[camera] = now, message.boot_id
 
     def compare_rates(self, message: pb.Observation, arrival: float | None) -> None:
         """Note a frame, also one left out, to find times and numbers that stand still. arrival: as of ``receive``."""

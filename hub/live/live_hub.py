@@ -58,7 +58,8 @@ _CHECK_EVERY_S = 60.0  # s: between two tests of a given calibration, which take
 _BUDGET_NOTICE_S = 10.0
 """How long the status names a camera that exceeded its budget."""
 _UNSEEN = "pose and clock are of an earlier answer, no detections since"
-_RESTARTED = "restarted and not located since: pose and clock are of an earlier answer, before the restart"
+_OTHER_CLOCK = "restarted and not located since"
+_RESTARTED = f"{_OTHER_CLOCK}: pose and clock are of an earlier answer, before the restart"
 _MAX_STD_GROWTH = 1.5
 """An answer whose stds are larger than the present one's by this factor is not taken: its rows say less."""
 
@@ -152,6 +153,8 @@ class LiveHub:
         self._solved_boot_ids: dict[str, str] = {}
         self._restarted: dict[str, CameraCalibration] = {}
         """By camera whose clock is another one since, until it is located again: as it was before."""
+        self._moved = set[str]()
+        """Cameras that were moved since they were first located."""
         self._rig_cameras: dict[str, RigCamera] = {}
         """Of all answers so far, the reloaded one included."""
         self._reloaded: ReloadedCalibration | None = None
@@ -415,6 +418,21 @@ class LiveHub:
         absent, others = [name for name in given if name not in heard], [name for name in heard if name not in given]
         return f"not heard of rig's {listed(absent)}; not in it: {listed(others)}" if absent and others else ""
 
+    def _on_other_clocks(self) -> list[str]:
+        """Calibrated cameras whose present run is not the one that the answer's clocks are of."""
+        if self.calibration is None or not self._solved_boot_ids:
+            return []
+        present, boots = self._in_present_segments(self.calibration)[1], self.links.boots
+        return sorted(name for name, boot in present.items() if boots.get(name, boot) != boot)
+
+    def _moved_from_references(self) -> list[str]:
+        """Cameras that were moved, with a position, a rotation or a distance that was measured before."""
+        if self.session is None:
+            return []
+        rig = self.session[0]
+        ends = {name for one in rig.distances for name in one[:2]}
+        return sorted(one for one in self._moved & rig.cameras.keys() if one in ends or rig.cameras[one].pose_table())
+
     def offset_stds(self) -> dict[str, float]:
         """Standard deviation [s] of each calibrated camera's time offset."""
         cameras = {} if self.calibration is None else self.calibration.cameras
@@ -430,6 +448,10 @@ class LiveHub:
         silent = [f"{name} ({age:.0f} s)" for name, age in ages.items() if age > SILENT_S]
         silent += [f"{name} (none since this hub was started)" for name in never]
         out += [f"no frames from {listed(silent)}"] if silent else []
+        if restarted := self._on_other_clocks():
+            out.append(f"{listed(restarted)}: {_OTHER_CLOCK}")
+        if outdated := self._moved_from_references():
+            out.append(f"{listed(outdated)}: moved from where the rig's references say; measure again, restart the hub")
         exceeding = self.budgets.exceeded(now, _BUDGET_NOTICE_S)
         if exceeding:
             out.append(f"frames left out of {listed(exceeding)}: more than a camera may send")
@@ -452,6 +474,7 @@ class LiveHub:
         waiting = {} if self.calibration is None else self.calibration.refused
         out = []
         shared, of_people = self.stream.marker.shared_motions_s(), not self._has_marker()
+        restarted = self._on_other_clocks()
         for name in self.stream.marker.cameras:
             fault = self.links.standing.get(name) or self._pixel_faults.get(name)
             reason = fault or waiting.get(name, refused.get(name, ""))
@@ -466,6 +489,8 @@ class LiveHub:
             if name in tied:
                 silent = self._now - self.links.last_frame.get(name, self._now) > SILENT_S
                 state, reason = ("degraded", "no frames") if silent else ("calibrated", "")
+                if name in restarted and not silent:
+                    state, reason = "searching", _OTHER_CLOCK
             out.append(
                 pb.CameraProgress(
                     camera=name,
@@ -672,12 +697,13 @@ class LiveHub:
         found = answer.calibration
         for name, since in answer.moved.items():
             self.counters["moved"] += 1
+            self._moved.add(name)
             self.stream.marker.forget_before(name, since)
         observations = job.observations if answer.observations is None else answer.observations
         rows = len(observations)
         # As many rows may have larger stds, once the noise is known better: only fewer must not replace more.
         fewer = rows < self._answer_rows and not job.verify and self.calibration is not None
-        if fewer and not self._says_more(found, answer.moved):
+        if fewer and not self._says_more(found, answer.moved) and not self._on_other_clocks():
             self.counters["not_better"] += 1
             return [event]
         self.counters["verified" if job.verify else "solved"] += 1
@@ -901,10 +927,17 @@ def merge_rigs(observed: Rig, own: Rig | None) -> Rig:
     cameras = dict(observed.cameras)
     for name, camera in own.cameras.items():
         if name in cameras:
-            cameras[name] = camera
+            cameras[name] = _completed(camera, cameras[name])
     ordered = {name: cameras[name] for name in own.cameras if name in cameras}
     ordered |= {name: camera for name, camera in cameras.items() if name not in ordered}
     metadata = observed.metadata | own.metadata
     if "target" in observed.metadata:  # what is seen is what the rows are of
         metadata["target"] = observed.metadata["target"]
     return Rig(ordered, own.units, own.clock, own.distances, own.up, metadata, own.file)
+
+
+def _completed(own: RigCamera, heard: RigCamera) -> RigCamera:
+    """A camera of the hub's own rig.toml, with what that leaves out and the camera tells: lens, rate and pose."""
+    groups = (("intrinsics", "focal_std"), ("position", "position_std"), ("rotation", "rotation_std"), ("readout",))
+    absent = [key for keys in groups if getattr(own, keys[0]) is None for key in keys]
+    return replace(own, fps=own.fps or heard.fps, **{key: getattr(heard, key) for key in absent})

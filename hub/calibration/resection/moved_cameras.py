@@ -133,8 +133,16 @@ def _likely_maps(labels: list[SeenLabel], camera: CameraInput) -> list[tuple[flo
     return maps
 
 
+def likely_division(costs: Floats) -> float:
+    """Share of the rows behind which the mean of their costs (n,) under one pose changes most.
+
+    The better half of a camera's last quarter is from before a move, unless an eighth of all rows is after it.
+    """
+    return float(np.argmax(np.abs(np.cumsum(costs - costs.mean()))) + 1) / len(costs)
+
+
 def best_division(
-    count: int, least: int, costs: Callable[[slice], Floats], starts: Iterable[float] = STARTS
+    count: int, least: int, costs: Callable[[slice], Floats], starts: Iterable[float]
 ) -> tuple[float, int]:
     """Mean cost of ``count`` rows by two poses, and how many of them have the first.
 
@@ -172,10 +180,11 @@ def _divide(
         residual = resected_residuals(world[part], image[part], world, image, focal)
         return np.asarray(np.minimum(residual, TRUNCATION_PX) ** 2)
 
-    together = float(costs(slice(None)).mean())
+    by_one = costs(slice(None))
+    together = float(by_one.mean())
     if together < _LEAST_PX**2:
         return None  # whatever two poses explain
-    cost, at = best_division(count, least, costs)
+    cost, at = best_division(count, least, costs, (*STARTS, likely_division(by_one)))
     if min(times[at - 1] - times[0], times[-1] - times[at]) < _LEAST_S:
         return None
     poses = resect(world[:at], image[:at]), resect(world[at:], image[at:])

@@ -150,6 +150,43 @@ def test_a_restarted_reference_camera_leaves_the_reference_clock_as_it_is(sessio
     assert (base.clock_rate, base.time_offset) == (1.0, 0.0), "a file's reference clock is one of its cameras'"
 
 
+def test_when_all_cameras_were_restarted_they_are_tracked_again_as_soon_as_they_are_located(session: Session) -> None:
+    """The answer on the clocks of before was from more rows, so it stayed until there were as many: without a track."""
+    long = simulate(71, 3, 50)
+    rows = [one for one in messages(long, "boot1", 5000.0) if isinstance(one, pb.Observation)]
+    began = [one for one in messages(long) if isinstance(one, pb.Observation)]
+
+    def between(stream: list[pb.Observation], begin: float, end: float, shift: float) -> list[Message]:
+        true = [long.true_time(one.camera, one.device_time_ns / NANOSECONDS - shift) for one in stream]
+        return [one for at, one in sorted(zip(true, stream, strict=True), key=lambda x: x[0]) if begin <= at < end]
+
+    hub, out = LiveHub(SETTINGS), []
+    infos = messages(long)[:3]
+    stream = [*infos, *between(began, 0.0, 35.0, 0.0), *between(rows, 35.0, 45.0, 5000.0)]
+    for number, message in enumerate(stream):
+        hub.handle(message)
+        if number % 20 == 19:
+            out += hub.tick(number / 100.0)
+            if message.boot_id == "boot1" and hub.boot_ids["cam0"] == "boot0":  # type: ignore[attr-defined]
+                state, reason = hub.state(number / 100.0)
+                assert (state, "restarted and not located since" in reason) == ("degraded", True)
+    assert set(hub.boot_ids.values()) == {"boot1"}
+    assert hub.state(len(stream) / 100.0)[0] == "calibrated"
+    assert hub.counters["not_better"] == 0
+
+
+def test_a_moved_camera_is_named_where_it_was_measured_before() -> None:
+    """Its old position bent the world of all cameras by centimetres and degrees, and the hub was calibrated."""
+    moved = simulate(71, 4, 40).turned("cam1", 25.0, 0.15)
+    rig = Rig({}, distances=(("cam0", "cam1", 5.0),))
+    hub = LiveHub(SETTINGS, rig=rig)
+    feed(hub, messages(moved))
+    assert hub.counters["moved"] == 1
+    state, reason = hub.state(1e6)
+    assert state == "degraded"
+    assert "cam1: moved from where the rig's references say" in reason
+
+
 def test_a_camera_whose_lens_is_refuted_does_not_come_back_with_every_search() -> None:
     """Joined again, its lens was not tested before the next full search: in and out, at a wrong place."""
     session = simulate(73, 5, 40)

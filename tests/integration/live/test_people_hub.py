@@ -30,8 +30,9 @@ from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, read_calibration
-from protocols.session.rig import Rig
+from protocols.session.rig import Rig, RigCamera
 from protocols.topics import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
+from tests.support import rigs
 from tests.support.people_traffic import Traffic, film
 from tests.support.samples import camera_info, eventually
 from tests.support.threads import running
@@ -223,6 +224,17 @@ def test_what_is_seen_is_the_target_whatever_the_hubs_own_file_says() -> None:
     own = Rig({}, metadata={"target": "charuco:7x5", "scene": "yard"})
     assert merge_rigs(Rig({}, metadata={"target": "person"}), own).metadata == {"target": "person", "scene": "yard"}
     assert merge_rigs(Rig({}), own).metadata["target"] == "charuco:7x5"
+
+
+def test_what_the_hubs_own_file_leaves_out_of_a_camera_is_as_the_camera_tells() -> None:
+    """With a table for a distance, of a size only, a camera lost its lens: it was refused, or another one estimated."""
+    heard = rigs.simulate(5, 2, 2).rig
+    own = Rig({"cam0": RigCamera("cam0", (1280, 720), position=np.ones(3))}, distances=(("cam0", "cam1", 3.0),))
+    merged = merge_rigs(heard, own)
+    assert merged.cameras["cam0"].intrinsics is heard.cameras["cam0"].intrinsics
+    assert merged.cameras["cam0"].fps == heard.cameras["cam0"].fps
+    assert merged.cameras["cam0"].position is own.cameras["cam0"].position
+    assert merged.cameras["cam1"] is heard.cameras["cam1"]
 
 
 @pytest.mark.parametrize(("turned", "state"), [(0.0, "calibrated"), (0.02, "degraded"), (0.14, "degraded")])

@@ -175,6 +175,25 @@ def test_a_moved_camera_is_found_again_where_it_stands(shift_m: float, turn_rad:
     assert abs(float(before.reference_from_camera(at)) - float(after.reference_from_camera(at))) < 3e-3
 
 
+def test_where_the_path_follows_one_camera_alone_there_is_no_clock_step() -> None:
+    """What rounding left of the information of such a step made it 1e19 s, and the solver failed for a minute."""
+    session = simulate(43, 4, 50, fps=(28, 34, 17, 43), fastest=0.4, windows=[(0, 50), (0, 43), (0, 50), (0, 50)])
+    last = calibrate(session.rig, until(session, 38.0))
+    update = update_calibration(session.rig, until(session.turned("cam3", 40.0, 0.17), 48.5), last, full=False)
+    assert list(update.moved) == ["cam3"]
+
+
+def test_a_camera_moved_after_a_long_time_is_found_within_seconds() -> None:
+    """A division into two poses began with the last quarter of the rows, the better half of which is from before."""
+    session = simulate(33, 4, 60, fastest=0.4)
+    last = calibrate(session.rig, until(session, 50.0))
+    turned = session.turned("cam1", 55.0, np.radians(8.0))
+    update = update_calibration(session.rig, until(turned, 57.5), last, full=False)
+    assert list(update.moved) == ["cam1"]
+    assert abs(session.true_time("cam1", update.moved["cam1"]) - 55.0) < 0.3
+    assert turned.turn_error({name: camera.pose for name, camera in update.calibration.cameras.items()}) < 0.01
+
+
 @pytest.mark.parametrize(("seed", "angle"), [(4, 0.09), (10, 0.09), (4, -0.03), (12, 0.3)])
 def test_a_move_of_one_of_two_cameras_is_named_and_the_rows_since_then_are_used(seed: int, angle: float) -> None:
     """It is no clock step, and the path does not follow both poses."""
