@@ -11,6 +11,7 @@ import numpy as np
 
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.target_models import PERSON
+from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration
@@ -33,7 +34,7 @@ _IS_GIVEN = np.abs(_SHIFTS_S) <= 2 * _SHIFT_S  # which of them are as good as no
 _MIN_IN_PLANE = 0.5
 """Share of one camera's boxes with one of the other's in the epipolar plane, at the best lag, that is no chance: with
 at most half of it at the given one, none of 17 simulated rigs with right offsets was warned of, 38 of 68 others."""
-_GROUNDS: Floats = np.arange(-4.0, 5.0) / 10.0
+GROUNDS: Floats = np.arange(-4.0, 5.0) / 10.0
 """Heights of the ground that are tried, in people's heights from where people of 1.7 m would stand. Of the crowd it is
 0.1, by which places at 20 m are 1 m off: there all 21 pairs of cameras see the same people, elsewhere one to five."""
 _MIN_MET_THERE, _MIN_OF_BEST = 0.3, 0.5
@@ -70,7 +71,7 @@ def shifted_people(
     On level ground, where most meet at the best lags: people's mean height does not tell it well enough. usual: where
     it would be along ``up`` (3,) if all were of `PERSON`'s size [units of the calibration].
     """
-    grounds: Floats = usual + PERSON.size_m / METRES_PER_UNIT[known.calibration.units] * _GROUNDS
+    grounds: Floats = usual + PERSON.size_m / METRES_PER_UNIT[known.calibration.units] * GROUNDS
 
     def most(levels: Floats, shifts: Floats) -> tuple[float, dict[tuple[str, str], Floats], float]:
         """Of these grounds the one on which most meet: their mean share in pairs of cameras, all shares, the ground."""
@@ -90,7 +91,11 @@ def _meetings(
     messages: Sequence[pb.Observation], known: GivenCalibration, up: Floats, ground: float, shifts: Floats
 ) -> dict[tuple[str, str], Floats]:
     """`_shares` of people who are where another camera sees somebody, by pair, on ground so far along ``up``."""
-    seen = {name: _standing(one, messages, up, ground) for name, one in known.calibration.cameras.items()}
+    seen = {name: seen_feet(one, messages) for name, one in known.calibration.cameras.items()}
+    seen = {
+        name: (times, on_ground(known.calibration.cameras[name].pose, rays, up, ground))
+        for name, (times, rays) in seen.items()
+    }
     pairs, within = dict[tuple[str, str], Floats](), WITHIN * PERSON.size_m / METRES_PER_UNIT[known.calibration.units]
     for a, b in combinations([name for name, (times, _) in seen.items() if len(times) > 1], 2):
         (times, places), (others, candidates), camera = seen[a], seen[b], known.calibration.cameras[b]
@@ -116,10 +121,8 @@ def _shares(shifts: Floats, times: Floats, others: Floats, there: Bools, met: Ca
     """
     shares = np.zeros(len(shifts))
     for number, shift in enumerate(shifts):
-        wanted = times + shift
-        after = np.clip(np.searchsorted(others, wanted), 1, len(others) - 1)
-        nearest = after - (wanted - others[after - 1] < others[after] - wanted)
-        near = there & (np.abs(others[nearest] - wanted) * 1e9 <= SAME_TIME_NS)[:, None]
+        nearest, at_once = at_same_time(times + shift, others)
+        near = there & at_once[:, None]
         shares[number] = (met(nearest) & near).sum() / near.sum() if near.sum() >= MIN_LOOKED_AT else 0.0
     return shares
 
@@ -145,11 +148,9 @@ def _other_lags(pairs: Mapping[tuple[str, str], Floats], what: str, least: float
     return tuple(out)
 
 
-def _standing(
-    camera: CameraCalibration, messages: Sequence[pb.Observation], up: Floats, ground: float
-) -> tuple[Floats, Floats]:
-    """Reference times (n,) [s] of a camera's frames with people, and where these stand (n, k, 3) on level ground that
-    lies so far along ``up``; NaN where a frame has fewer."""
+def seen_feet(camera: CameraCalibration, messages: Sequence[pb.Observation]) -> tuple[Floats, Floats]:
+    """Reference times (n,) [s] of a camera's frames with people, and unit vectors to their feet (n, k, 3) in its axes;
+    NaN where a frame has fewer."""
     tracked = TrackingCamera.from_calibration(camera)
     frames = sorted(
         (tracked.reference_ns(one.device_time_ns) * 1e-9, feet)
@@ -157,15 +158,29 @@ def _standing(
         if one.camera == camera.name and (feet := [(*d.foot,) for d in one.detections if d.head and d.foot])
     )
     counts = np.array([len(feet) for _, feet in frames], dtype=np.int64)
-    places = np.full((len(frames), max(counts, default=0), 3), np.nan)
+    rays = np.full((len(frames), max(counts, default=0), 3), np.nan)
     if frames:
-        rays = camera.intrinsics.unproject(np.concatenate([feet for _, feet in frames]))
-        foot = np.hstack([rays, np.ones((len(rays), 1))]) @ camera.pose.rotation
-        with np.errstate(divide="ignore", invalid="ignore"):
-            away = (ground - camera.pose.position @ up) / (foot @ up)
-        away[~(away > 0.0)] = np.nan
-        places[np.arange(places.shape[1]) < counts[:, None]] = camera.pose.position + away[:, None] * foot
-    return np.array([time for time, _ in frames]), places
+        found = camera.intrinsics.unproject(np.concatenate([feet for _, feet in frames]))
+        found = np.hstack([found, np.ones((len(found), 1))])
+        rays[np.arange(rays.shape[1]) < counts[:, None]] = found / np.linalg.norm(found, axis=1, keepdims=True)
+    return np.array([time for time, _ in frames]), rays
+
+
+def on_ground(pose: Pose, rays: Floats, up: Floats, ground: float) -> Floats:
+    """Where rays (…, 3) in a camera's axes meet level ground that lies so far along ``up``; NaN for those that never
+    do."""
+    directions = rays @ pose.rotation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = (ground - pose.position @ up) / (directions @ up)
+    away = np.where(away > 0.0, away, np.nan)
+    return np.asarray(pose.position + away[..., None] * directions)
+
+
+def at_same_time(wanted: Floats, others: Floats) -> tuple[Ints, Bools]:
+    """The frames (n,) nearest to wanted times (n,) [s] among others, ascending, and whether they are near enough."""
+    after = np.clip(np.searchsorted(others, wanted), 1, len(others) - 1)
+    nearest = after - (wanted - others[after - 1] < others[after] - wanted)
+    return nearest, np.asarray(np.abs(others[nearest] - wanted) * 1e9 <= SAME_TIME_NS)
 
 
 def _vehicle_rays(camera: CameraCalibration, messages: Sequence[pb.Observation]) -> tuple[Floats, Floats, Floats]:

@@ -19,6 +19,7 @@ from deploy.offline.follow.lags import (
     shifted_people,
     shifted_vehicles,
 )
+from deploy.offline.follow.poses import turned_people
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.target_models import PERSON
 from protocols.core.errors import InputError
@@ -114,7 +115,8 @@ def check_units(
     ):
         nowhere = _nowhere(bodies[0], [known.calibration.cameras[name] for name in people], height)
         ground = float(np.median((bodies[0].centre + height * bodies[0].foot) @ bodies[0].up))
-        return nowhere or shifted_people(messages, known, bodies[0].up, ground)
+        where = messages, known, bodies[0].up, ground
+        return turned_people(*where) or nowhere or shifted_people(*where)
     raise _refusal(_MISTAKES[best], bodies[best].up, known, session)
 
 

@@ -20,6 +20,7 @@ from deploy.offline.follow.source import FollowInput, read_follow_input
 from edge.scenes.common.base import look_at_pose
 from hub.tracking.offline import FollowedTrack
 from protocols.core.errors import InputError, Refused
+from protocols.geometry import so3
 from protocols.geometry.pose import POSE_CONVENTIONS, Pose
 from tests.support import crowds
 from tests.support.crowds import NAMES, SIZE, boxes_csv, ends, poses, write_calibration
@@ -149,6 +150,35 @@ def test_people_who_meet_at_another_lag_are_warned_of(tmp_path: Path, late: floa
         return
     (warning,) = [one for one in warnings if "time_offset" in one]
     assert warning.startswith(f"{NAMES[1]}: its people fit those of {NAMES[0]}, {NAMES[2]} with about {-late:+.1f} s")
+
+
+@pytest.mark.parametrize("degrees", [0.0, 0.3, -4.0, 15.0])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_camera_that_was_turned_is_named(tmp_path: Path, name: str, degrees: float) -> None:
+    """A turn by 5° made thirteen tracks of four people without a word."""
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    camera = known.calibration.cameras[name]
+    turned = Pose(camera.pose.rotation @ so3.exp(np.radians(degrees) * np.array([0.0, 0.6, 0.8])), camera.pose.position)
+    cameras = {**known.calibration.cameras, name: replace(camera, pose=turned)}
+    known = replace(known, calibration=replace(known.calibration, cameras=cameras))
+    warnings = read_follow_input(rows(tmp_path, boxes_csv(30.0)), known, "person", tmp_path).warnings
+    others = ", ".join(one for one in NAMES if one != name)
+    said = rf"{name}: its people are [0-9.]+ m \(([0-9.]+)°\) off those of {others}: it was turned or moved since"
+    found = [float(match[1]) for one in warnings if (match := re.match(said, one))]
+    assert len(warnings) == len(found) == (abs(degrees) > 1.0)
+    assert all(0.5 * abs(degrees) < one < 1.1 * abs(degrees) for one in found)
+
+
+@pytest.mark.parametrize("metres", [0.02, 0.5])
+def test_of_two_cameras_the_one_that_was_moved_is_not_known(tmp_path: Path, metres: float) -> None:
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    two = {name: known.calibration.cameras[name] for name in NAMES[:2]}
+    pose = two[NAMES[1]].pose
+    two[NAMES[1]] = replace(two[NAMES[1]], pose=replace(pose, position=pose.position + metres * pose.rotation[0]))
+    known = replace(known, calibration=replace(known.calibration, cameras=two))
+    text = "".join(line for line in boxes_csv(30.0).splitlines(True) if not line.startswith(NAMES[2]))
+    warnings = read_follow_input(rows(tmp_path, text), known, "person", tmp_path).warnings
+    assert ["off each other: one of them was turned or moved" in one for one in warnings] == [True] * (metres > 0.1)
 
 
 def test_boxes_beyond_the_border_are_not_cut_there(tmp_path: Path) -> None:
