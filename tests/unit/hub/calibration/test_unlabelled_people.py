@@ -181,7 +181,7 @@ def test_unlabelled_people_calibrate_cameras_that_share_no_clock(
 
 
 def test_a_wrong_lens_is_warned_of() -> None:
-    rig, messages = session(40.0, OFFSETS)
+    rig, messages = session(25.0, OFFSETS)
     matrix = np.diag([1.1, 1.1, 1.0]) @ crowds.lens().matrix + np.outer([-48.0, -36.0, 0.0], [0.0, 0.0, 1.0])
     rig.cameras["back"] = replace(rig.cameras["back"], intrinsics=Intrinsics(*crowds.SIZE, matrix))
     found, _ = calibrate_people(rig, messages)
@@ -212,7 +212,7 @@ def test_people_who_would_lean_are_refused(calibrated: tuple[Calibration, Observ
 
 
 def test_a_camera_without_a_measured_lens_is_refused_by_name() -> None:
-    rig, messages = session(40.0, OFFSETS)
+    rig, messages = session(25.0, OFFSETS)
     rig.cameras["back"] = RigCamera(name="back", size=crowds.SIZE, fps=5.0)
     found, _ = calibrate_people(rig, messages)
     assert "no intrinsics" in found.refused["back"]
@@ -220,7 +220,7 @@ def test_a_camera_without_a_measured_lens_is_refused_by_name() -> None:
 
 
 def test_people_who_are_not_the_same_are_refused() -> None:
-    rig, messages = session(40.0, OFFSETS)
+    rig, messages = session(25.0, OFFSETS)
     rng = np.random.default_rng(0)
     for message in messages:  # everybody is somewhere else in each frame
         for one in message.detections:
