@@ -226,6 +226,7 @@ class LiveHub:
             self.stream.release(name)
             self.links.last_frame.pop(name, None)
             self._restarted.pop(name, None)
+            self._moved.discard(name)
             self._rig_cameras.pop(name, None)
         if self.calibration is not None:
             kept = {name: one for name, one in self.calibration.cameras.items() if name not in cameras}
@@ -448,7 +449,7 @@ class LiveHub:
         silent = [f"{name} ({age:.0f} s)" for name, age in ages.items() if age > SILENT_S]
         silent += [f"{name} (none since this hub was started)" for name in never]
         out += [f"no frames from {listed(silent)}"] if silent else []
-        if restarted := self._on_other_clocks():
+        if restarted := sorted({*self._on_other_clocks(), *self._restarted}):
             out.append(f"{listed(restarted)}: {_OTHER_CLOCK}")
         if outdated := self._moved_from_references():
             out.append(f"{listed(outdated)}: moved from where the rig's references say; measure again, restart the hub")
@@ -703,7 +704,8 @@ class LiveHub:
         rows = len(observations)
         # As many rows may have larger stds, once the noise is known better: only fewer must not replace more.
         fewer = rows < self._answer_rows and not job.verify and self.calibration is not None
-        if fewer and not self._says_more(found, answer.moved) and not self._on_other_clocks():
+        again = [name for name in self._on_other_clocks() if boots.get(name) == self.links.boots.get(name)]
+        if fewer and not again and not self._says_more(found, answer.moved):
             self.counters["not_better"] += 1
             return [event]
         self.counters["verified" if job.verify else "solved"] += 1
@@ -853,7 +855,7 @@ class LiveHub:
             size = self.stream.image_size(name)
             if size not in (None, camera.size):
                 sent, given = ("{}x{}".format(*one) for one in (size, camera.size))
-                out[name] = f"{name} sends images of {sent}, and its lens in the hub's file is for {given}"
+                out[name] = f"{name} sends images of {sent}, and the hub's file is for {given}"
         return out
 
     def _source(self) -> SessionBuilder | PeopleTracklets:
@@ -937,7 +939,9 @@ def merge_rigs(observed: Rig, own: Rig | None) -> Rig:
 
 
 def _completed(own: RigCamera, heard: RigCamera) -> RigCamera:
-    """A camera of the hub's own rig.toml, with what that leaves out and the camera tells: lens, rate and pose."""
-    groups = (("intrinsics", "focal_std"), ("position", "position_std"), ("rotation", "rotation_std"), ("readout",))
-    absent = [key for keys in groups if getattr(own, keys[0]) is None for key in keys]
+    """A camera of the hub's own rig.toml, with what that leaves out and the camera tells: lens, readout, rate, pose."""
+    absent = [key for key in ("intrinsics", "readout") if getattr(own, key) is None]
+    absent += ["focal_std"] if own.intrinsics is None else []
+    if not own.pose_table():  # half a pose of each would be in two worlds
+        absent += ["position", "position_std", "rotation", "rotation_std"]
     return replace(own, fps=own.fps or heard.fps, **{key: getattr(heard, key) for key in absent})

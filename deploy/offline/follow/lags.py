@@ -26,6 +26,7 @@ WITHIN = 0.35
 """Distance, as a share of a person's height, within which the feet that two cameras see are one person's: 0.6 m, which
 somebody walks between two frames 0.4 s apart."""
 SAME_TIME_NS = 250_000_000  # a camera at 2 Hz has a frame as near as this to every chosen moment
+_MOST_AT_ONCE = 20  # or three times as many as usual: frames with more false boxes than people would fill gigabytes
 MIN_LOOKED_AT = 30  # of what one camera sees where another one looks: a share of fewer says nothing
 _SHIFT_S = 0.2  # within which a car at 10 m/s drives half its length
 _SHIFTS_S: Floats = _SHIFT_S * np.arange(-75.0, 76.0)
@@ -157,6 +158,8 @@ def seen_feet(camera: CameraCalibration, messages: Sequence[pb.Observation]) -> 
         for one in messages
         if one.camera == camera.name and (feet := [(*d.foot,) for d in one.detections if d.head and d.foot])
     )
+    most = max(_MOST_AT_ONCE, 3 * float(np.median([len(feet) for _, feet in frames] or [0])))
+    frames = [(time, feet) for time, feet in frames if len(feet) <= most]
     counts = np.array([len(feet) for _, feet in frames], dtype=np.int64)
     rays = np.full((len(frames), max(counts, default=0), 3), np.nan)
     if frames:

@@ -176,7 +176,7 @@ def _scene(messages: Sequence[pb.Observation], known: GivenCalibration, up: Floa
     rays = dict[tuple[str, str], tuple[Floats, Floats]]()
     for name, (times, mine) in seen.items():
         usually = np.isfinite(mine[:, :, 0]).sum() / len(times)
-        count = int(np.clip(_PEOPLE / usually, FRAMES // 3, 2 * FRAMES))
+        count = int(np.clip(_PEOPLE / max(usually, 1.0), FRAMES // 3, 2 * FRAMES))
         some = np.unique(np.linspace(0, len(times) - 1, count).astype(int))
         for other, (others, theirs) in seen.items():
             at, near = at_same_time(times[some], others)

@@ -160,19 +160,40 @@ def test_when_all_cameras_were_restarted_they_are_tracked_again_as_soon_as_they_
         true = [long.true_time(one.camera, one.device_time_ns / NANOSECONDS - shift) for one in stream]
         return [one for at, one in sorted(zip(true, stream, strict=True), key=lambda x: x[0]) if begin <= at < end]
 
-    hub, out = LiveHub(SETTINGS), []
+    hub, named = LiveHub(SETTINGS), 0
     infos = messages(long)[:3]
     stream = [*infos, *between(began, 0.0, 35.0, 0.0), *between(rows, 35.0, 45.0, 5000.0)]
     for number, message in enumerate(stream):
         hub.handle(message)
         if number % 20 == 19:
-            out += hub.tick(number / 100.0)
+            hub.tick(number / 100.0)
             if message.boot_id == "boot1" and hub.boot_ids["cam0"] == "boot0":  # type: ignore[attr-defined]
                 state, reason = hub.state(number / 100.0)
                 assert (state, "restarted and not located since" in reason) == ("degraded", True)
+                named += 1
+    assert named
     assert set(hub.boot_ids.values()) == {"boot1"}
     assert hub.state(len(stream) / 100.0)[0] == "calibrated"
     assert hub.counters["not_better"] == 0
+
+
+def test_a_restarted_camera_is_named_until_it_is_located_again() -> None:
+    """After the first answer without it the hub was calibrated, whether or not it came back."""
+    session = simulate(71, 3, 35)
+    began = [one for one in messages(session) if isinstance(one, pb.Observation)]
+    again = [one for one in messages(session, "boot1", 5000.0) if isinstance(one, pb.Observation)]
+    hub, states, restarted = LiveHub(SETTINGS), list[tuple[str, str]](), False
+    for message in messages(session)[:3]:
+        hub.handle(message)
+    for number, (old, new) in enumerate(zip(began, again, strict=True)):
+        late = old.camera == "cam2" and session.true_time("cam2", old.device_time_ns / NANOSECONDS) > 20.0
+        restarted |= late
+        hub.handle(new if late else old)
+        if number % 20 == 19:
+            hub.tick(number / 100.0)
+            states += [hub.state(number / 100.0)] if restarted else []
+    assert states[-1][1].endswith("2 cameras calibrated")
+    assert all(state == "degraded" and "cam2: restarted and not located since" in reason for state, reason in states)
 
 
 def test_a_moved_camera_is_named_where_it_was_measured_before() -> None:
@@ -328,7 +349,7 @@ def test_a_camera_that_sends_other_images_than_the_hubs_file_is_for_is_named(ses
         feed(hub, messages(session))
     else:
         assert set(hub.calibration.cameras) == {"cam0", "cam2"}
-    assert "cam1 sends images of 1280x720, and its lens in the hub's file is for 1920x1080" in hub.state(1e6)[1]
+    assert "cam1 sends images of 1280x720, and the hub's file is for 1920x1080" in hub.state(1e6)[1]
 
 
 def test_pictures_of_another_size_are_refused_by_a_hub_too() -> None:
