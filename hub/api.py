@@ -179,9 +179,9 @@ def read_session(path: str | Path, observations: str | Path | None = None) -> Se
     from protocols.topics import CAMERA_INFO, OBSERVATION, RIG_INFO, STATUS
 
     reader = LogReader(path)
-    messages = (logged.message for logged in reader.messages([OBSERVATION, CAMERA_INFO, RIG_INFO, STATUS]))
+    topics = [OBSERVATION, CAMERA_INFO, RIG_INFO, STATUS]
     try:
-        found = session_from_messages(messages)
+        found = session_from_messages(lambda: ((one.message, one.log_time_ns) for one in reader.messages(topics)))
     except Refused as refusal:
         raise no_session(path, refusal) from None
     damage = (f"the log is damaged: {reader.damage}",) if reader.damage else ()

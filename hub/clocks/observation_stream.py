@@ -15,6 +15,7 @@ from google.protobuf.message import Message
 
 from hub.clocks.change_detector import ClockChange
 from hub.clocks.external_prior import ArrivalPriors, ExternalClockPrior, ExternalClockPriors
+from hub.clocks.recorded_pauses import FrameKey, RecordedTimes
 from hub.clocks.segments import SEGMENT_MIN_ROWS, ClockSegments, RateChanges
 from hub.tracking.calibration.people import MIN_INTERVAL_NS, PERSON, SEVERAL_SHARE, PeopleTracklets
 from hub.tracking.detections import tracked_kind
@@ -213,20 +214,16 @@ class RecordedStream:
     warnings: tuple[str, ...]
 
 
-def session_from_messages(messages: Iterable[Message]) -> RecordedStream:
-    """The session of a log's messages.
+def session_from_messages(read: Callable[[], Iterable[tuple[Message, int]]]) -> RecordedStream:
+    """The session of a log's messages. read: these in the order of the log, each with its log time [ns].
 
-    Times of arrival are not used: a log of other makers holds whatever they wrote. Raises Refused where there is
-    nothing to calibrate from, and InputError for rows that are no pixels of their images.
+    A log of other makers holds whatever times of arrival they wrote: they are used only to tell pauses from steps of a
+    clock, for which the log is read once more. Raises Refused where there is nothing to calibrate from, and InputError
+    for rows that are no pixels of their images.
     """
-    stream = ObservationStream()
-    for message in messages:
-        if isinstance(message, pb.AgentStatus):
-            stream.clock_priors.handle(message)
-            continue
-        if isinstance(message, pb.Observation):
-            message, _ = stream.assign(message, None)
-        stream.store(message)
+    stream, times = _streamed(read(), set())
+    if pauses := times.pauses():
+        stream, _ = _streamed(read(), pauses)
     of_marker = stream.has_marker(LEAST_ROWS)
     by_camera = {} if of_marker else stream.several_people()
     people = tuple(itertools.chain(*by_camera.values()))
@@ -242,6 +239,23 @@ def session_from_messages(messages: Iterable[Message]) -> RecordedStream:
     )
     warnings = alarms + stream.marker.warnings + column_warnings(rig, observations)
     return RecordedStream(rig, observations, stream.clock_priors.for_boots(boots), people, warnings)
+
+
+def _streamed(
+    messages: Iterable[tuple[Message, int]], pauses: Collection[FrameKey]
+) -> tuple[ObservationStream, RecordedTimes]:
+    """The stream after a log's messages, and their times. pauses: frames before which a clock did not jump."""
+    stream, times = ObservationStream(), RecordedTimes()
+    for message, log_time_ns in messages:
+        if isinstance(message, pb.AgentStatus):
+            stream.clock_priors.handle(message)
+            continue
+        if isinstance(message, pb.Observation):
+            sent, waited = message, (message.camera, message.boot_id, message.sequence) in pauses
+            message, change = stream.assign(sent, None, backlog=waited)
+            times.handle(sent, log_time_ns, change)
+        stream.store(message)
+    return stream, times
 
 
 def are_several(messages: Collection[pb.Observation]) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import itertools
+from collections import Counter
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -26,12 +28,12 @@ from tests.support.rigs import simulate
 TOPICS = {"CameraInfo": CAMERA_INFO, "Observation": OBSERVATION, "AgentStatus": STATUS}
 
 
-def recorded(file: Path, content: Iterable[Message]) -> Path:
+def recorded(file: Path, content: Iterable[Message], times_ns: Iterable[int] | None = None) -> Path:
     file.parent.mkdir(exist_ok=True)
     with LogWriter(file, {}) as writer:
-        for number, message in enumerate(content):
+        for message, time_ns in zip(content, times_ns or itertools.count(0, 10**6), strict=False):
             agent = getattr(message, "camera", "") or getattr(message, "agent", "")
-            writer.write(TOPICS[message.DESCRIPTOR.name], agent, "yard", message, 10**6 * number)
+            writer.write(TOPICS[message.DESCRIPTOR.name], agent, "yard", message, time_ns)
     return file
 
 
@@ -60,6 +62,55 @@ def test_a_clock_that_is_set_in_the_middle_of_a_log_costs_the_shorter_side(tmp_p
     assert abs(true) < 3e-3
     (warning,) = [text for text in found.warnings if "clock of cam1 stepped" in text]
     assert "+7.0" in warning
+
+
+def written(
+    lost: Collection[str], stepped: Collection[str], size: float, times: str
+) -> tuple[list[Message], list[int]]:
+    """Three cameras of 25 to 30 fps: 12 s after the start some lose 0.8 s of frames, uncounted, or their clocks step.
+
+    times: what the log has, arrivals ("real"), nothing ("none"), or the cameras' own times ("own").
+    """
+    session = simulate(72, 3, 30, drops=0.0)
+    content, log_ns, missing = list[Message](), list[int](), Counter[str]()
+    for message in messages(session):
+        true = 0.0
+        if isinstance(message, pb.Observation):
+            camera = message.camera
+            true = session.true_time(camera, message.device_time_ns * 1e-9)
+            if camera in lost and 12.0 <= true < 12.8:
+                missing[camera] += 1
+                continue
+            message.frame -= missing[camera]
+            message.device_time_ns += round(1e9 * size) if camera in stepped and true >= 16.0 else 0
+        own = getattr(message, "device_time_ns", 0)
+        log_ns.append({"real": round(1e9 * true) + 10**18, "none": 0, "own": max(own, 0)}[times])
+        content.append(message)
+    order = np.argsort(log_ns, kind="stable") if times == "real" else range(len(content))
+    return [content[i] for i in order], [log_ns[i] for i in order]
+
+
+@pytest.mark.parametrize("times", ["real", "none", "own"])
+def test_frames_lost_uncounted_are_no_step_of_a_clock(tmp_path: Path, times: str) -> None:
+    content, log_ns = written(["cam0", "cam1", "cam2"], [], 0.0, times)
+    session = read_session(recorded(tmp_path / "lost.mcap", content, log_ns))
+    assert not session.warnings
+    assert len(session.observations) == sum(isinstance(message, pb.Observation) for message in content)
+
+
+@pytest.mark.parametrize(
+    ("stepped", "times"), [(["cam1"], "real"), (["cam1"], "none"), (["cam1"], "own"), (["cam1", "cam2"], "real")]
+)
+@pytest.mark.parametrize("size", [0.3, 9.0])
+def test_clocks_that_are_set_are_told_from_lost_frames(
+    tmp_path: Path, stepped: list[str], size: float, times: str
+) -> None:
+    """Two clocks at once, as of one machine, are told by the log's times."""
+    session = read_session(recorded(tmp_path / "set.mcap", *written(["cam1"], stepped, size, times)))
+    assert len(session.warnings) == 2 * len(stepped), "of each the step, and what was left out"
+    for name in stepped:
+        (step,) = [text for text in session.warnings if f"clock of {name} stepped by" in text]
+        assert float(step.split("stepped by ")[1].split()[0]) == pytest.approx(size, abs=0.02)
 
 
 def test_the_folder_of_a_recording_is_calibrated_and_triangulated_as_its_log(tmp_path: Path) -> None:
