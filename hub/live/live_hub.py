@@ -939,7 +939,7 @@ def merge_rigs(observed: Rig, own: Rig | None) -> Rig:
 
 
 def _completed(own: RigCamera, heard: RigCamera) -> RigCamera:
-    """A camera of the hub's own rig.toml, with what that leaves out from the camera's messages: lens, readout, rate, pose."""
+    """A camera of the hub's own rig.toml, completed by the camera's messages: lens, readout, rate and pose."""
     absent = [key for key in ("intrinsics", "readout") if getattr(own, key) is None]
     absent += ["focal_std"] if own.intrinsics is None else []
     if not own.pose_table():  # half a pose of each would be in two worlds
