@@ -14,13 +14,13 @@ from functools import partial
 import numpy as np
 
 from edge.uav.base import Box, Estimate, Telemetry, TrackState
-from edge.uav.ground import colour_table
 from edge.uav.ground.image_plane import apply_homography
 from edge.uav.ground.localisation import CameraLocaliser
 from edge.uav.ground.overlay_layers import LazyLayers
 from edge.uav.ground.road_map import RoadMap
 from edge.uav.prediction import particle_filter as pf
 from edge.uav.prediction import particle_set
+from edge.uav.prediction.detection_probability import detection_probability
 from edge.uav.prediction.driver_model import DriverModel
 from edge.uav.prediction.occlusion import OcclusionPredictor
 from edge.uav.prediction.particle_set import ParticleSet
@@ -33,7 +33,6 @@ from edge.uav.target.redetection import Redetector
 from edge.uav.target.state_estimate import estimate_target
 from edge.uav.target.target import Target
 from edge.uav.target.tracklets import Tracklet, Tracklets
-from protocols.geometry import kernels
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.order_statistics import quantile
 from protocols.geometry.types import Floats, Image, Ints
@@ -56,9 +55,6 @@ _HEADING_STD = 0.06  # of a heading from the template [rad]
 _REDETECT_AFTER = 12  # missed frames after which the full frame is searched
 # Weight of injected particles per second, and its limit: the target took an unknown path.
 _INJECTION_RATE, _MAX_INJECTED_WEIGHT = 0.002, 0.02
-_DETECTION_PROBABILITIES = (0.03, 0.03, 0.1, 0.3)  # per frame, with 0 to 3 of the car's test points on open road
-_OPEN_ROAD = -0.3  # log-likelihood ratio of its colour above which a point is open road
-_END_OFFSET = 0.35  # of the outer test points from the centre, over the length
 _LOST_INJECTED_WEIGHT = 0.1  # the same limit once the target is lost
 _TRACKLET_WEIGHT = 0.02  # of the particles injected at a tracklet
 _ROAD_UPDATE_EVERY = 3  # frames
@@ -215,7 +211,7 @@ class GroundTracker:
             particles,
             candidates,
             tracklets,
-            self._detection_probability(working, particles, pixels),
+            detection_probability(working, localiser, self._road, pixels, particles, target.length),
             lambda found: (
                 target.position_std(found.visible_share) + slack,
                 target.position_std(found.visible_share, found.score) + slack,
@@ -324,38 +320,6 @@ class GroundTracker:
                     self._particles, found.ground, motion, weight * plausibility, self._rng
                 )
         return out
-
-    def _detection_probability(self, working: Image, particles: ParticleSet, pixels: Floats) -> Floats:
-        """(n,) probability of detecting the target at the particles: 0 outside the image, small where occluded.
-
-        pixels: (n, 2) image points of the particles. A car is detectable where all of it is on open road.
-        """
-        inside = self._localiser.plane.inside(pixels, 2.0)
-        out = np.zeros(len(pixels))
-        if not inside.any() or self._localiser.frames_without_pose or not self._road.has_colour_model:
-            return np.where(inside & (self._localiser.frames_without_pose == 0), _DETECTION_PROBABILITIES[0], 0.0)
-        open_road = self._open_road(working, particles.position[inside], particles.heading[inside])
-        out[inside] = np.array(_DETECTION_PROBABILITIES)[open_road]
-        return out
-
-    def _open_road(self, working: Image, positions: Floats, headings: Floats) -> Ints:
-        """How many (n,) of a car's middle and ends are on open road, of cars at positions (n, 2) with headings (n,)."""
-        localiser, reach = self._localiser, _END_OFFSET * self._target.length
-        if localiser.plane.compiled:
-            counts, camera = np.empty(len(positions), np.int64), localiser.plane.kernel_arguments(localiser.matrix)
-            image = localiser.downscale, *working.shape[:2], np.ascontiguousarray(working), localiser.photometric.table
-            colours = *self._road.colour_table, _OPEN_ROAD
-            kernels.call("open_road", *camera, len(counts), positions, headings, reach, *image, *colours, counts)
-            return counts
-        half_length = reach * np.column_stack([np.cos(headings), np.sin(headings)])
-        points = np.concatenate([positions, positions - half_length, positions + half_length])
-        last_pixel = np.array([working.shape[1] - 1, working.shape[0] - 1])
-        ground = np.fmax(localiser.pixels(points), -1.0)  # not a number behind the camera
-        at = np.clip((ground / localiser.downscale).astype(int), 0, last_pixel)
-        corrected = localiser.photometric.corrected(working[at[:, 1], at[:, 0]][None])[0]
-        bits, table = self._road.colour_table
-        open_road = colour_table.values(table, corrected, bits) > _OPEN_ROAD
-        return np.asarray(open_road.reshape(3, -1).sum(axis=0), dtype=np.int64)
 
     def _handle_detection(self, image: Image, best: Candidate, measurement: MeasurementLikelihood) -> None:
         """Update motion, position and appearance from a detection."""

@@ -24,6 +24,7 @@ from edge.uav.ground.plane_pose import PlaneHomography, PlanePose
 from edge.uav.ground.road_map import RoadMap
 from edge.uav.ground_tracker import GroundTracker
 from edge.uav.prediction import paths
+from edge.uav.prediction.detection_probability import open_road
 from edge.uav.prediction.particle_filter import densest_cluster
 from edge.uav.target.motion_history import MotionHistory
 from hatch_build import FLAGS
@@ -309,7 +310,9 @@ def test_open_road_is_counted_alike(both: Both, gain: float) -> None:
     tracker._road.learn_colours(working[:60].reshape(-1, 3), working, 1.0)
     tracker._road._log_ratio_table = rng.normal(size=16**3).astype(np.float32)
     positions, headings = tracker._target.position + rng.normal(0.0, 20.0, (400, 2)), rng.normal(0.0, 2.0, 400)
-    compiled, alone = both(lambda: tracker._open_road(working, positions, headings))
+    compiled, alone = both(
+        lambda: open_road(working, tracker._localiser, tracker._road, positions, headings, tracker._target.length)
+    )
     assert set(alone) == {0, 1, 2, 3}
     np.testing.assert_array_equal(compiled, alone)
 
