@@ -29,7 +29,9 @@ from protocols.session.rig import METRES_PER_UNIT, Rig
 
 _SOUND_M_S = 340.0  # at 1000 times its size, what walks, drives or flies is beyond it
 _WAS_IT = "was it moved, or its clock set?"
-_ODD_GAIN = 1.3  # times the residuals of two of three cameras: of noisier detections all three pairs have alike
+_FEW, _ODD_GAIN = 8, 1.3
+"""Cameras, of which each is left out in turn: of more the path follows the many. And times the residuals of the others,
+which of noisier detections are alike whichever is left out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,19 +162,18 @@ def _reconstruct(prepared: PreparedSession, known: Mapping[str, CameraCalibratio
 
 
 def _odd_one(prepared: PreparedSession, known: Mapping[str, CameraCalibration], names: list[str]) -> dict[str, str]:
-    """Of three cameras, the one without which the other two fit far better than with it, and this as the reason.
+    """Of a few cameras, the one without which the others fit far better than with it, and this as the reason.
 
-    Its misfit is no larger than theirs: the path follows whichever has most rows. Empty where no one stands out, and
-    of more cameras, where the path follows the many.
+    Its own misfit may be less than theirs: the path follows whichever has most rows. Empty where no one stands out.
     """
     residuals = {}
-    for name in names if len(names) == 3 else ():
+    for name in names if 2 < len(names) <= _FEW else ():
         with suppress(Refused):
             rest = _reconstruct(prepared, known, [other for other in names if other != name])
             residuals[float(np.mean(rest.state.sigma))] = name
-    if len(residuals) < 3:
+    if len(residuals) < len(names):
         return {}
-    least, more, _ = sorted(residuals)
+    least, more, *_ = sorted(residuals)
     reason = f"the others fit to {least:.1f} px without it, to {more:.1f} px with it"
     return {residuals[least]: reason} if more > _ODD_GAIN * least else {}
 

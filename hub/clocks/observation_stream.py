@@ -165,9 +165,7 @@ class ObservationStream:
         rows = [self.marker.rows(name) for name in self.marker.cameras]
         return not self.people.cameras or sum(count >= least_rows for count in rows) >= 2
 
-    def build(
-        self, of_marker: bool, *, refusing: bool = True, newest_s: float = math.inf
-    ) -> tuple[Rig, Observations]:
+    def build(self, of_marker: bool, *, refusing: bool = True, newest_s: float = math.inf) -> tuple[Rig, Observations]:
         """The rig and the observations of the marker, or of people. Raises Refused where there are none, if asked.
 
         newest_s: only what arrived in the last so many seconds, of the marker.

@@ -600,7 +600,7 @@ class LiveHub:
         return refusal
 
     def _check_known(self, now: float) -> None:
-        """Have the given calibration tested by the present rows, every minute; the answer is for the status."""
+        """Have the given calibration tested by the newest rows; the answer is for the status."""
         assert self.calibration is not None
         if now < self._next_check or not self._can_verify(self.calibration):
             return
