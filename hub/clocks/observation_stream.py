@@ -241,7 +241,7 @@ def session_from_messages(read: Callable[[], Iterable[tuple[Message, int]]]) -> 
         for text in stream.clocks.alarms.values()
         if of_marker or people
     )
-    warnings = alarms + stream.marker.warnings + column_warnings(rig, observations)
+    warnings = alarms + stream.marker.warnings(stream.clocks.first_segment) + column_warnings(rig, observations)
     return RecordedStream(rig, observations, stream.clock_priors.for_boots(boots), people, warnings)
 
 

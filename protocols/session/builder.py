@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -197,13 +197,12 @@ class SessionBuilder:
         """Use a boot only once it has so many detections; until then the boot before it is used."""
         self._settled[boot] = rows
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What was omitted from the session."""
+    def warnings(self, run_of: Callable[[str], str] = str) -> tuple[str, ...]:
+        """What was omitted of other runs of cameras. run_of: the run that a boot id, as of a clock's segment, is of."""
         warnings = []
         for camera in sorted(self._boots):
             kept = self.boot(camera)
-            lost = sum(len(boot) for name, boot in self._boots[camera].items() if name != kept)
+            lost = sum(len(boot) for name, boot in self._boots[camera].items() if run_of(name) != run_of(kept))
             if lost:
                 warnings.append(
                     f"{camera} was restarted, which begins a new clock: {lost} detections of other boots left out"
