@@ -28,6 +28,10 @@ from protocols.session.observations import Observations
 from protocols.session.rig import METRES_PER_UNIT, Rig
 
 _SOUND_M_S = 340.0  # at 1000 times its size, what walks, drives or flies is beyond it
+_WAS_IT = "was it moved, or its clock set?"
+_FEW, _ODD_GAIN = 8, 1.3
+"""Cameras, of which each is left out in turn: of more the path follows the many. And times the residuals of the others,
+which of noisier detections are alike whichever is left out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,17 +98,21 @@ def _triangulate(
             refusal.permanent = True
             raise refusal
         # Of three and more, the camera that fits worst is removed, and the trajectories are estimated without it.
-        worst = failures[0][0]
-        unused[worst] = f"{failures[0][1].reason}: was it moved?"
-        names = [name for name in names if name != worst]
+        odd = _odd_one(prepared, known, reconstruction.names) or {failures[0][0]: failures[0][1].reason}
+        unused |= {name: f"{reason}: {_WAS_IT}" for name, reason in odd.items()}
+        names = [name for name in names if name not in odd]
     report("covariances", 0.8)
     tables = _on_reference_clock(rig, prepared, known, reconstruction)
     if not any(len(table.time) for table in tables):
         raise Refused("no label is seen by two cameras within 0.2 s of each other", unused)
     sigmas = _sigmas(reconstruction)
     warnings = [*prepared.warnings, *unlikely_speed(rig.metadata.get("scale", "metric"), rig.units, tables)]
-    for name, (sigma, calibrated_rms) in larger_residuals(reconstruction, known).items():
-        warnings.append(f"{name}: residuals of {sigma:.1f} px, {calibrated_rms:.1f} px when it was calibrated")
+    larger = {
+        name: f"residuals of {sigma:.1f} px, {calibrated_rms:.1f} px when it was calibrated"
+        for name, (sigma, calibrated_rms) in larger_residuals(reconstruction, known).items()
+    }
+    odd = _odd_one(prepared, known, reconstruction.names) if larger else {}
+    warnings += [f"{name}: {why}: {_WAS_IT}" for name, why in (odd or larger).items()]
     triangulated = {table.label for table in tables if len(table.time)}
     return Triangulation(
         tuple(table for table in tables if len(table.time)),
@@ -151,6 +159,23 @@ def _reconstruct(prepared: PreparedSession, known: Mapping[str, CameraCalibratio
     reconstruction = reconstruct_with_known_poses(cameras, graph, prepared.rows, prepared.labels, poses, clock=False)
     problem, state, _ = adjust(reconstruction.problem, reconstruction.state)
     return Reconstruction(reconstruction.names, reconstruction.labels, problem, state)
+
+
+def _odd_one(prepared: PreparedSession, known: Mapping[str, CameraCalibration], names: list[str]) -> dict[str, str]:
+    """Of a few cameras, the one without which the others fit far better than with it, and this as the reason.
+
+    Its own misfit may be less than theirs: the path follows whichever has most rows. Empty where no one stands out.
+    """
+    residuals = {}
+    for name in names if 2 < len(names) <= _FEW else ():
+        with suppress(Refused):
+            rest = _reconstruct(prepared, known, [other for other in names if other != name])
+            residuals[float(np.mean(rest.state.sigma))] = name
+    if len(residuals) < len(names):
+        return {}
+    least, more, *_ = sorted(residuals)
+    reason = f"the others fit to {least:.1f} px without it, to {more:.1f} px with it"
+    return {residuals[least]: reason} if more > _ODD_GAIN * least else {}
 
 
 def _time_maps(

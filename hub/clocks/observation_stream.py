@@ -7,6 +7,7 @@ external clock priors and arrivals.
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -164,10 +165,13 @@ class ObservationStream:
         rows = [self.marker.rows(name) for name in self.marker.cameras]
         return not self.people.cameras or sum(count >= least_rows for count in rows) >= 2
 
-    def build(self, of_marker: bool, *, refusing: bool = True) -> tuple[Rig, Observations]:
-        """The rig and the observations of the marker, or of people. Raises Refused where there are none, if asked."""
+    def build(self, of_marker: bool, *, refusing: bool = True, newest_s: float = math.inf) -> tuple[Rig, Observations]:
+        """The rig and the observations of the marker, or of people. Raises Refused where there are none, if asked.
+
+        newest_s: only what arrived in the last so many seconds, of the marker.
+        """
         if of_marker:
-            rig, observations = self.marker.build()
+            rig, observations = self.marker.build(newest_s)
             return rig, self._with_rate_changes_corrected(observations)
         cameras = {name: rig_camera_from_info(self._infos[name]) for name in sorted(self._infos)}
         rig = Rig(cameras, metadata={"target": PERSON})
@@ -237,7 +241,7 @@ def session_from_messages(read: Callable[[], Iterable[tuple[Message, int]]]) -> 
         for text in stream.clocks.alarms.values()
         if of_marker or people
     )
-    warnings = alarms + stream.marker.warnings + column_warnings(rig, observations)
+    warnings = alarms + stream.marker.warnings(stream.clocks.first_segment) + column_warnings(rig, observations)
     return RecordedStream(rig, observations, stream.clock_priors.for_boots(boots), people, warnings)
 
 

@@ -114,6 +114,11 @@ class ClockSegments:
                 )
         return replace(calibration, cameras=cameras), names
 
+    def first_segment(self, segment: str) -> str:
+        """The segment in which the run of the camera's agent began that ``segment`` is of."""
+        change = self.change_into(segment)
+        return segment if change is None else self.first_segment(change.previous_segment)
+
     def change_into(self, segment: str) -> ClockChange | None:
         """The change that began ``segment``, in its present estimate; None if no change did."""
         return self._detector.change_into(segment)

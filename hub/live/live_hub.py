@@ -54,7 +54,9 @@ _BEHIND_S = 10.0
 SILENT_S = 3.0
 """A camera without a frame for longer than this degrades the hub."""
 _VERIFY_EVERY_S = 0.5  # s: between two tests of a reloaded answer
-_CHECK_EVERY_S = 60.0  # s: between two tests of a given calibration, which take a second or two
+_CHECK_EVERY_S, _CHECK_LOAD, _CHECKED_S = 20.0, 0.5, 60.0
+"""Between two tests of a given calibration, less often where they take more than this share of a core; and the newest
+rows that each is by: a camera that was moved is named once they are more than those before."""
 _BUDGET_NOTICE_S = 10.0
 """How long the status names a camera that exceeded its budget."""
 _UNSEEN = "pose and clock are of an earlier answer, no detections since"
@@ -598,13 +600,14 @@ class LiveHub:
         return refusal
 
     def _check_known(self, now: float) -> None:
-        """Have the given calibration tested by the present rows, every minute; the answer is for the status."""
+        """Have the given calibration tested by the newest rows; the answer is for the status."""
         assert self.calibration is not None
         if now < self._next_check or not self._can_verify(self.calibration):
             return
         self._next_check = now + _CHECK_EVERY_S
         try:
-            rig, observations, people = self._build_session()
+            # Rows from before a camera was moved would speak for it, those with much motion for half an hour.
+            rig, observations, people = self._build_session(_CHECKED_S)
         except Refused:
             return
         except Exception as error:  # noqa: BLE001 - whatever is wrong with the rows must not stop the hub
@@ -612,20 +615,23 @@ class LiveHub:
             return
         self.solver_failure = ""
         assert self._rig is not None
-        tracks = {key: one for key, one in observations.tracks.items() if key[0] in self.calibration.cameras}
+        source = self._source()
+        present, _ = self._in_present_segments(self.calibration, {name: source.boot(name) for name in rig.cameras})
+        tracks = {key: one for key, one in observations.tracks.items() if key[0] in present.cameras}
         observations = replace(observations, tracks=tracks)
         self._jobs += 1
         rig = replace(self._rig, metadata=rig.metadata)
         people = tuple(one for one in people if one.camera in self.calibration.cameras)
-        job = SolverJob(self._jobs, rig, observations, self.calibration, verify=True, people=people)
+        job = SolverJob(self._jobs, rig, observations, present, verify=True, people=people)
         self._submitted, self._submitted_at, self._submitted_boots = job, now, {}
         self.solver.submit(job, now)
 
-    def _take_check(self, answer: SolverAnswer) -> None:
+    def _take_check(self, answer: SolverAnswer, now: float) -> None:
         """What the present rows say of the given calibration; that they say too little is no news."""
+        self._next_check = max(self._next_check, now + answer.cpu_s / _CHECK_LOAD)
         found = answer.calibration
         if found is None:
-            self._known_faults = [answer.reason] if answer.permanent else []
+            self._known_faults = [answer.reason] if answer.permanent else self._known_faults
             return
         self._known_faults = [*(f"{name}: {why}" for name, why in found.refused.items()), *found.warnings]
 
@@ -662,7 +668,7 @@ class LiveHub:
         job, boots = self._submitted, self._submitted_boots
         self._submitted = None
         if self._known is not None:
-            self._take_check(answer)
+            self._take_check(answer, now)
             return []
         tied, cameras = (len(one.cameras) if one else 0 for one in (self.calibration, job and job.rig))
         cpu_s = answer.cpu_s
@@ -814,14 +820,14 @@ class LiveHub:
         clocks = {name: one.time_map for name, one in calibration.cameras.items()}
         return sum(held >= _MIN_PEOPLE_S for held in self.stream.people.shared_seconds(clocks).values()) >= 2
 
-    def _build_session(self) -> tuple[Rig, Observations, tuple[pb.Observation, ...]]:
+    def _build_session(self, newest_s: float = np.inf) -> tuple[Rig, Observations, tuple[pb.Observation, ...]]:
         """The rig and the observations: of the marker or, if there is none, of people, whose colours may tell nobody.
 
         And the frames of several unlabelled people, as soon as two cameras have filmed them for long enough.
         """
         of_marker = self._has_marker() or not self.settings.solve
         held = {} if of_marker else self.stream.several_people(self._now)
-        rig, observations = self.stream.build(of_marker, refusing=False)
+        rig, observations = self.stream.build(of_marker, refusing=False, newest_s=newest_s)
         spans = [(one[-1].device_time_ns - one[0].device_time_ns) / NANOSECONDS for one in held.values()]
         least = min(_COLOURS_FILM_S if len(observations) else _MIN_FILM_S, 0.8 * self.stream.people_window_s)
         people = tuple(itertools.chain(*held.values())) if sum(span >= least for span in spans) >= 2 else ()
@@ -905,6 +911,8 @@ class LiveHub:
         """The calibration in the clocks' present segments, or in those of ``until``, and the boot ids of them."""
         source = self._source()
         boots = {name: self._solved_boot_ids.get(name) or source.boot(name) for name in calibration.cameras}
+        if self._known is not None:  # its clocks are those of a run's begin, whatever segment is in use now
+            boots = {name: self.stream.clocks.first_segment(boot) for name, boot in boots.items()}
         return self.stream.clocks.to_present(calibration, boots, until)
 
 

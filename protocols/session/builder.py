@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -197,25 +197,24 @@ class SessionBuilder:
         """Use a boot only once it has so many detections; until then the boot before it is used."""
         self._settled[boot] = rows
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What was omitted from the session."""
+    def warnings(self, run_of: Callable[[str], str] = str) -> tuple[str, ...]:
+        """What was omitted of other runs of cameras. run_of: the run that a boot id, as of a clock's segment, is of."""
         warnings = []
         for camera in sorted(self._boots):
             kept = self.boot(camera)
-            lost = sum(len(boot) for name, boot in self._boots[camera].items() if name != kept)
+            lost = sum(len(boot) for name, boot in self._boots[camera].items() if run_of(name) != run_of(kept))
             if lost:
                 warnings.append(
                     f"{camera} was restarted, which begins a new clock: {lost} detections of other boots left out"
                 )
         return tuple(warnings)
 
-    def build(self) -> tuple[Rig, Observations]:
-        """The session so far. Raises Refused where there is no camera or no detection."""
+    def build(self, newest_s: float = math.inf) -> tuple[Rig, Observations]:
+        """The session so far, or of what arrived last. Raises Refused where there is no camera or no detection."""
         if not self._cameras:
             raise Refused("no camera has introduced itself yet" if not self._boots else "no camera published its info")
         order = sorted(self._cameras)
-        parts = [self._used(camera) for camera in order]
+        parts = [self._used(camera, self._chunk - newest_s / CHUNK_S) for camera in order]
         names = [camera for camera, (rows, used) in zip(order, parts, strict=True) if len(used)]
         if not names:
             raise Refused("no camera has seen anything yet")
@@ -263,8 +262,8 @@ class SessionBuilder:
         for camera, boot, first, last, count in ranges:
             self._selection.setdefault(camera, []).append((boot, first, last, count))
 
-    def _used(self, camera: str) -> tuple[Any, Ints]:
-        """A camera's rows, and the indices of those that are used: one a time and label."""
+    def _used(self, camera: str, after: float = -math.inf) -> tuple[Any, Ints]:
+        """A camera's rows, and the indices of those that are used: one a time and label, of intervals ``after`` one."""
         boots = self._boots.get(camera)
         nothing = np.zeros(0, dtype=_ROW), np.zeros(0, dtype=np.int64)
         if not boots:
@@ -282,7 +281,8 @@ class SessionBuilder:
                 inside |= thinned if abs(thinned.sum() - count) < abs(run.sum() - count) else run
             return rows, self._one_a_time(rows, np.flatnonzero(inside))
         rows = boots[self.boot(camera)].table()
-        used = np.flatnonzero(rows["time_ns"] >= self._since.get((camera, self.boot(camera)), -(2**63)))
+        since = self._since.get((camera, self.boot(camera)), -(2**63))
+        used = np.flatnonzero((rows["time_ns"] >= since) & (rows["chunk"] > after))
         return rows, self._one_a_time(rows, used)
 
     @staticmethod

@@ -30,7 +30,6 @@ from protocols.core.errors import Refused  # noqa: E402
 from protocols.geometry import so3  # noqa: E402
 from protocols.geometry.pose import Pose  # noqa: E402
 from protocols.geometry.types import Floats  # noqa: E402
-from protocols.session.calibration import CameraCalibration  # noqa: E402
 from protocols.session.observations import DEFAULT_LABEL, read_observations  # noqa: E402
 from protocols.session.rig import read_rig  # noqa: E402
 from tests.bench.live_run import RunFailed, run_live  # noqa: E402
@@ -96,11 +95,7 @@ def simulated(seconds: float, seed: int) -> Reference:
     """Eight cameras, one of which joins late and one of which is bumped. The offline path knows no bump."""
     windows = [(seconds / 3.0 if f"cam{i}" == LATE else 0.0, seconds) for i in range(_CAMERAS)]
     session = rigs.simulate(seed, _CAMERAS, seconds, fps=(_FPS,), windows=windows)
-    truth = {
-        name: CameraCalibration(name, lens, session.poses[name], session.clocks[name], 0.0, np.zeros(3), 0.0)
-        for name, camera in session.rig.cameras.items()
-        if (lens := camera.intrinsics) is not None
-    }
+    truth = session.true_cameras()
     found = calibrate(session.rig, session.observations())
     table, base = found.trajectories[0], found.cameras[found.reference].time_map
     clock = session.clocks[found.reference]

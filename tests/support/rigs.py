@@ -15,6 +15,7 @@ from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats, Ints
+from protocols.session.calibration import CameraCalibration
 from protocols.session.folder import write_observations
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
 from protocols.session.rig import Rig, RigCamera
@@ -108,6 +109,14 @@ class Session:
         found = self.rig.cameras[name].intrinsics
         assert found is not None
         return found
+
+    def true_cameras(self) -> dict[str, CameraCalibration]:
+        """The cameras as they are, as a calibration without errors on the true clock."""
+        zero = np.zeros(3)
+        return {
+            name: CameraCalibration(name, self.lens(name), pose, self.clocks[name], 0.0, zero, 0.0)
+            for name, pose in self.poses.items()
+        }
 
     def smoothed(self, name: str) -> dict[str, SmoothTrack]:
         """A camera's tracks by label, all with one time origin."""

@@ -47,7 +47,7 @@ def session_from_log(file: Path) -> tuple[Rig, Observations, tuple[str, ...]]:
     except Refused as refusal:
         raise no_session(file, refusal) from None
     damage = (f"the log is damaged: {reader.damage}",) if reader.damage else ()
-    return rig, observations, damage + builder.warnings
+    return rig, observations, damage + builder.warnings()
 
 
 def no_session(file: Path, refusal: Refused) -> InputError:

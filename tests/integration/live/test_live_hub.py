@@ -518,6 +518,30 @@ def test_a_given_calibration_that_the_rows_contradict_is_named(
     assert said in text
 
 
+@pytest.mark.parametrize("step", [0.0, 3.0])
+def test_under_a_given_calibration_a_camera_that_is_moved_is_named_and_a_clock_that_is_set_is_not(step: float) -> None:
+    """Rows from before spoke for it, for half an hour where they had more motion; a clock's step was undone later."""
+    session = simulate(5, 4, 90.0, fps=(10.0, 15.0, 30.0, 5.0))
+    given, true = session.true_cameras(), session.true
+    later = session.of_camera("cam1") & (true > 40.0)
+    hub = LiveHub(LiveSettings(track=False), known=KnownCalibration(session.rig, given))
+    if step:
+        session = replace(session, time=session.time + step * later)
+    else:
+        session = session.turned("cam1", 40.0, 0.08)
+    order, published = np.argsort(true), list[Message]()
+    for message in info_messages(session, lambda _: "boot0"):
+        hub.handle(message)
+    rows = row_messages(session, lambda _: "boot0", order.tolist(), lambda i: float(session.time[i]))
+    for number, (message, at) in enumerate(zip(rows, true[order].tolist(), strict=True)):
+        hub.handle(message, at)
+        published += hub.tick(at) if number % 20 == 0 else []
+    assert ("the given calibration: cam1: " in hub.state(90.0)[1]) == (not step)
+    last = next(one for one in calibrations(published)[-1].cameras if one.camera == "cam1")
+    offset = given["cam1"].time_map.time_offset - given["cam1"].time_map.clock_rate * step
+    assert last.time_offset == pytest.approx(offset, abs=0.01)
+
+
 @pytest.mark.parametrize(("name", "said"), [("cam9", "not heard of rig's cam9; not in it: cam1, cam2"), ("cam1", "")])
 def test_a_wrong_name_in_the_hubs_rig_is_named_in_the_status(session: Session, name: str, said: str) -> None:
     """Its table was silently without effect."""
@@ -579,7 +603,7 @@ def test_rows_that_cannot_be_put_together_do_not_end_the_hub(
     hub, stream = LiveHub(SETTINGS), messages(session)
     feed(hub, stream[:-200] if calibrated else [])
 
-    def fails(of_marker: bool, refusing: bool) -> None:
+    def fails(*_: object, **given: object) -> None:
         raise IndexError("out of bounds")
 
     monkeypatch.setattr(hub.stream, "build", fails)

@@ -399,6 +399,14 @@ def test_known_cameras_in_one_place_are_refused_in_one_line(four: tuple[rigs.Ses
         triangulate(session.rig, cameras, session.observations())
 
 
+@pytest.mark.parametrize(("seed", "moved"), [(2, "cam0"), (2, "cam1"), (7, "cam2")])
+def test_of_three_given_cameras_the_one_that_was_moved_is_named(seed: int, moved: str) -> None:
+    """Another one was, and the path was of the moved one and the third."""
+    session = rigs.simulate(seed, 3, 15.0)
+    cameras = session.turned(moved, 0.0, 0.05).true_cameras()
+    assert triangulate(session.rig, cameras, session.observations()).contradicted == (moved,)
+
+
 def test_with_known_poses_motion_in_a_plane_gives_the_lags() -> None:
     path = rigs.random_path(np.random.default_rng(8))
     session = rigs.simulate(7, 3, 20.0, path=path)
