@@ -35,9 +35,8 @@ def cluster_robust(problem: Problem, state: AdjustmentState, found: Covariance, 
     for body in dict.fromkeys(bodies):
         parts = [rows for rows in problem.rows if bodies[rows.label] == body and rows.use.any()]
         if parts:
-            numbers, moves, residuals = map(
-                np.concatenate, zip(*(_of_rows(problem, state, found, paths, root, rows) for rows in parts), strict=True)
-            )
+            of_rows = (_of_rows(problem, state, found, paths, root, rows) for rows in parts)
+            numbers, moves, residuals = map(np.concatenate, zip(*of_rows, strict=True))
             order = np.argsort(numbers, kind="stable")
             cuts = np.flatnonzero(np.diff(numbers[order])) + 1
             pieces = (np.split(one[order], cuts) for one in (moves, residuals))
