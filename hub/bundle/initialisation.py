@@ -41,7 +41,7 @@ _MIN_BEARING_ANGLE = 0.05  # rad between two directions that intersect
 _MAX_PNP_POINTS = 400  # evenly spread: bounds the time of RANSAC
 _PNP_THRESHOLD_PX = 8.0  # generous: the first trajectory is rough
 _MIN_PNP_POINTS = 12  # twice the six unknowns of a pose
-_MIN_KNOT_SPACING, _MAX_KNOT_SPACING = 0.05, 0.3  # s
+MIN_KNOT_SPACING, _MAX_KNOT_SPACING = 0.05, 0.3  # s
 _FEW_FRAMES_PER_KNOT, _MANY_ROWS = 4.5, 3.0  # of a track's choice; of all cameras, to each of twice as many knots
 _MANY_TRACKS = 2.0**4.5
 """Tracks at once, of all labels and cameras, whose best spacing is nearer to half of one track's: what a cubic spline
@@ -69,7 +69,7 @@ class CameraInput:
     lens_prior: LensPrior | None = None
     readout_given: bool = False
     stated_std: float = 0.0
-    least_spacing: float = _MIN_KNOT_SPACING
+    least_spacing: float = MIN_KNOT_SPACING
 
 
 @dataclass(slots=True, eq=False)

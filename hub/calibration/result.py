@@ -19,6 +19,7 @@ from hub.bundle.datum.gauge import (
 )
 from hub.bundle.datum.held_gauge import similarity_to_published
 from hub.bundle.initialisation import SEEN_WITHIN_S, Reconstruction, observation_times, seen_by_two
+from hub.bundle.noise.cluster_robust import cluster_robust
 from hub.bundle.noise.noise_scale import rescale_noise
 from hub.bundle.noise.timestamp_jitter import weighted_by_jitter
 from hub.bundle.preprocessing import PreparedSession
@@ -112,6 +113,11 @@ def assemble_calibration(
     scaled = rescale_noise(noisy, scaled, prior)
     covariance = cov.covariance(noisy, scaled, prior, gauge.information, datum_points, gauge.exact)
     effects = sensitivities(rig, names, noisy, scaled, prior, covariance)
+    # The outline of a person is wrong for a second at a time, and in ways that depend on the place, as a lens is.
+    outlines = rig.metadata.get("target") == "person"
+    if outlines:
+        bodies = [label.rpartition("-")[0] or label for label in reconstruction.labels]
+        covariance = cluster_robust(noisy, scaled, covariance, bodies)
     lens_stds, readout_stds = np.sqrt(np.maximum(covariance.variances[:, [Column.FOCAL, Column.READOUT]], 0.0)).T
     time_origins = [solution.prepared.time_origins[name] for name in names]
     time_scales = [solution.prepared.time_scale(name) for name in names]
@@ -176,8 +182,6 @@ def assemble_calibration(
         )
         for i, name in enumerate(names)
     }
-    # The outline of a person is wrong in ways that depend on the place, as those of a lens do.
-    outlines = rig.metadata.get("target") == "person"
     tests_lenses = published is None and not outlines and not (online and len(names) > LARGE_NETWORK)
     tables = _tables(rig, solution.prepared, names, reconstruction.labels, problem, state, covariance, reference)
     return Calibration(

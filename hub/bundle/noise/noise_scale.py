@@ -29,6 +29,7 @@ from hub.bundle.problem import (
     UsedRows,
 )
 from hub.bundle.residuals import (
+    ResidualEvaluation,
     StackedTrajectories,
     evaluate_labels,
     evaluate_residuals,
@@ -48,7 +49,7 @@ _COMMON_DEGREES = 8.0
 """Degrees of freedom of the noise that all cameras have in common, as the prior of each: where its own residuals have
 fewer, they determine the variance worse than to half of itself."""
 _MIN_SIGMA_PX = 0.05  # px: residuals of 0, in simulated data, would have infinite weight
-_MAX_LAG_S = 2.0
+MAX_LAG_S = 2.0
 """Largest lag [s] of the autocorrelation of residuals."""
 _MAX_INFLATION = 1000.0  # rows per effective row: a bound
 _MIN_PAIRS = 200
@@ -202,16 +203,27 @@ def _hat_matrix_trace(
         of_some, blocks = by_path[some], found.blocks[block[some], first : first + BAND, first : first + BAND]
         leverage[some] = (of_some @ blocks * of_some).sum(axis=(1, 2))
     if columns:
-        rows_of_label, seeing, by_cameras = found.a_inv_b.parts[picked[0].label]
-        at = 3 * seen.index[:, None] - rows_of_label.start + np.arange(BAND)
-        shift = -by_path @ by_cameras[at]
-        parameters = problem.free_columns[seeing]
-        own = np.flatnonzero(parameters // CAMERA_PARAMETERS == number)
-        shift[:, :, own] += jacobian[:, :, 3 + parameters[own] % CAMERA_PARAMETERS]
-        shift = shift.reshape(-1, len(seeing))
+        shift = profiled_jacobian(problem, found, picked[0], seen, jacobian)
+        shift = shift.reshape(-1, shift.shape[-1])
         leverage += (shift @ known * shift).reshape(len(by_path), -1).sum(axis=1)
     # A coordinate has 1 at most; where a path passes through the camera's plane, rounding made it thousands.
     return float(np.minimum(leverage, 2.0) @ np.concatenate(times))
+
+
+def profiled_jacobian(
+    problem: Problem, found: Covariance, rows: TrackObservations, seen: ResidualEvaluation, jacobian: Floats
+) -> Floats:
+    """Derivatives (n, 2, k) of residuals by the k free parameters of a label's cameras, its path adapting to them.
+
+    rows: of the camera and label of the n residuals ``seen``. jacobian: (n, 2, 3 + 18) of `jacobians`, weighted.
+    """
+    rows_of_label, seeing, by_cameras = found.a_inv_b.parts[rows.label]
+    by_path = (seen.weights[:, None, :, None] * jacobian[:, :, None, :3]).reshape(-1, 2, BAND)
+    shift = -by_path @ by_cameras[3 * seen.index[:, None] - rows_of_label.start + np.arange(BAND)]
+    parameters = problem.free_columns[seeing]
+    own = np.flatnonzero(parameters // CAMERA_PARAMETERS == rows.camera)
+    shift[:, :, own] += jacobian[:, :, 3 + parameters[own] % CAMERA_PARAMETERS]
+    return np.asarray(shift)
 
 
 def modelled_inflation(problem: Problem, state: AdjustmentState, camera: int) -> float:
@@ -303,7 +315,7 @@ def _serial_inflation(parts: list[tuple[Floats, Floats]], frames: float = 1.0, m
     if step <= 0.0 or variance <= 0.0:
         return 1.0
     total = 1.0
-    for lag in range(1, round(_MAX_LAG_S / step) + 1):
+    for lag in range(1, round(MAX_LAG_S / step) + 1):
         product, pairs = 0.0, 0
         for time, residual in parts:
             if lag < len(time):

@@ -51,10 +51,6 @@ people walk, below which it tells no plane."""
 _ITERATIONS = 0
 """Of association over the whole recording: seven took more CPU than all else. Positions of a crowd, four halls and a
 room differed by 0.1 cm (one by 0.7, which was worse with seven), lags by 0.3 ms."""
-_LEAST_KNOT_SPACING_S = 0.15
-"""Of paths: the time constant of a silhouette's errors, whose correlation is 0.5 after 0.1 s and 0.3 after 0.2 s.
-Cross-validation takes them for motion: with knots 0.06 to 0.12 s apart clocks of seven rendered rooms were 10 ms off
-(rms), at stds of 2; with 0.15, 0.2 and 0.3 s by 4 to 5, at stds of 2 to 3."""
 _WANTED_INTERVAL_NS = NANOSECONDS // 2  # at which the tracker's paths are asked for; only their detections are used
 
 
@@ -132,8 +128,7 @@ def calibrate_people(
     bars = [bar for bar in rig.scale_bars if bar[:2] == ("head", "foot")]
     rig = replace(rig, metadata=rig.metadata | {"target": "person"})
     prepared = prepare(rig, observations)
-    cameras = {name: replace(one, least_spacing=_LEAST_KNOT_SPACING_S) for name, one in prepared.cameras.items()}
-    prepared = replace(prepared, cameras=cameras, refused=prepared.refused | refused)
+    prepared = replace(prepared, refused=prepared.refused | refused)
     poses = {name: camera.pose for name, camera in initial.items()}
     clocks = _time_maps(prepared, initial)
 
@@ -146,10 +141,7 @@ def calibrate_people(
         start = triangulate_and_adjust(
             prepared.cameras, states, prepared.rows, prepared.labels, (names[0], names[1]), free
         )
-        found = final_adjustment(start, report, shared_errors=True)
-        # Both ends of a box are off together across it: two rows say there what one does.
-        alike = 2.0 if any(label.endswith("-foot") for label in found.labels) else 1.0
-        return replace(found, state=replace(found.state, sigma=np.sqrt(alike) * found.state.sigma)), {}
+        return final_adjustment(start, report, shared_errors=True), {}
 
     try:
         solution = solve_network(prepared, [], report, place, clocks=clocks)
