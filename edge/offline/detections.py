@@ -19,7 +19,7 @@ from protocols.core.errors import InputError
 from protocols.core.files import write_together
 from protocols.core.tables import dataframe
 from protocols.session.calibration import csv_cell
-from protocols.session.detections import COLUMNS
+from protocols.session.observations import COLUMNS
 
 if TYPE_CHECKING:
     import pandas

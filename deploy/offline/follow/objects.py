@@ -26,8 +26,8 @@ from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.csv_table import CsvTable, read_csv_header, read_csv_table
-from protocols.session.detections import KINDS, DetectionRows, read_detections, swapped_ends
 from protocols.session.folder import BOXES_FILE
+from protocols.session.observations import KINDS, DetectionRows, read_detections, swapped_ends
 from protocols.validation.rules import SCHEMA_VERSION
 
 Kind = Literal["person", "vehicle"]
