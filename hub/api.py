@@ -17,7 +17,6 @@ import numpy as np
 
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import check_folder, remove_files, write_atomically, write_together
-from protocols.core.tables import dataframe
 from protocols.geometry import so3
 from protocols.log.read.session import is_log, load_session, no_session
 from protocols.session.calibration import (
@@ -29,6 +28,7 @@ from protocols.session.calibration import (
     read_calibration,
     trajectory_text,
 )
+from protocols.session.csv_table import dataframe
 from protocols.session.folder import RIG_FILE, labelled_file
 from protocols.session.observations import Observations, read_observations
 from protocols.session.result import refusal_document, result_document, result_text
