@@ -16,11 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.base import CUT_VEHICLE_STD, Detection, Prediction
-from edge.detectors.moving.association import match_predictions
 from edge.detectors.moving.camera_motion import ImageMotion
 from edge.detectors.moving.foreground import BackgroundSubtractor, SubtractorName
 from edge.detectors.moving.silhouette_detector import SilhouetteDetector
-from edge.detectors.moving.tracklets import ImageTracklet
+from edge.detectors.moving.tracklets import ImageTracklet, match_predictions
 from protocols.geometry.types import Floats, Image
 
 Box = tuple[float, float, float, float]

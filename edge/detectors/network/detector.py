@@ -63,7 +63,7 @@ class NetworkDetector:
         found = self._detections(image, self._infer([image])[0], time_s)
         if not predictions:
             return found
-        from edge.detectors.moving.association import match_predictions
+        from edge.detectors.moving.tracklets import match_predictions
 
         return match_predictions(found, predictions)
 
