@@ -15,7 +15,8 @@ from hub.report.quality_assessment import (
     capital,
     half_interval_ms,
 )
-from hub.report.svg import STYLE, THIN, esc, number, short, whole
+from hub.report.style import STYLE
+from hub.report.svg import THIN, esc, number, short, whole
 from hub.report.time_figures import OffsetStdSample
 from hub.report.wording import in_words_of
 from protocols.core.errors import Refused
