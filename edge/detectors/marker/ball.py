@@ -58,7 +58,6 @@ class InteractiveMarkerDetector:
     def detect(
         self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
     ) -> list[Detection]:
-        """Detections in an image (H, W, 3) uint8 BGR."""
         return self._detector.detect(image)
 
 

@@ -59,7 +59,6 @@ class NetworkDetector:
     def detect(
         self, image: Image, time_s: float | None = None, predictions: Sequence[Prediction] = ()
     ) -> list[Detection]:
-        """See ``Detector``."""
         found = self._detections(image, self._infer([image])[0], time_s)
         if not predictions:
             return found
