@@ -1,7 +1,7 @@
 """Whether a camera's clock jumped forward in a log since it was set, or because frames were lost that nobody counted.
 
-After a pause a camera's times are as far behind the log's, and the other cameras', as they were before it. What both
-sides of the jump say is used, unlike in `hub.clocks.change_detector`, which has to decide at once.
+After a pause a camera's times are as far behind the log's, and the other cameras', as they were before it. What
+both sides of the jump say is used, unlike in `hub.clocks.change_detector`, which has to decide at once.
 """
 
 from __future__ import annotations
