@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame
-from edge.devices.playback.base import Playback
-from edge.devices.playback.video_file import VideoPlayback
+from edge.devices.playback.video_file import Playback, VideoPlayback
 from edge.uav.estimator import decode_image
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
