@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from edge.devices.base import Device, Frame, WrappedDevice
 from edge.devices.settings import OakSettings, PiSettings, UsbSettings
-from protocols.bus.base import Closing
+from protocols.core.closing import Closing
 from protocols.core.errors import InputError
 
 if TYPE_CHECKING:

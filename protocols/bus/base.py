@@ -199,17 +199,3 @@ class CommandSubscription:
     def close(self) -> None:
         """Stop listening."""
         self._subscription.close()
-
-
-class Closing:
-    """Base of what is opened when it is made, and closed at the end of a ``with`` block."""
-
-    def close(self) -> None:
-        """Release it."""
-        raise NotImplementedError
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -22,10 +22,11 @@ from typing import NoReturn
 import msgspec
 import zenoh
 
-from protocols.bus.base import BusDead, Closing, agent_status
+from protocols.bus.base import BusDead, agent_status
 from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, split_endpoint
 from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
 from protocols.bus.transport.zenoh_bus import open_bus
+from protocols.core.closing import Closing
 from protocols.core.names import key_segment
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS

@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 
 from google.protobuf.message import Message
 
-from protocols.bus.base import AgentEvent, AgentWatch, Bus, Closing, Publisher, Received, Refusal, Subscription
+from protocols.bus.base import AgentEvent, AgentWatch, Bus, Publisher, Received, Refusal, Subscription
+from protocols.core.closing import Closing
 from protocols.core.ranges import MAX_CAMERAS
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import STATUS, TOPICS, Topic

@@ -14,8 +14,9 @@ from contextlib import contextmanager
 
 from google.protobuf.message import Message
 
-from protocols.bus.base import BusDead, Closing
+from protocols.bus.base import BusDead
 from protocols.bus.transport.inbox import InboxSubscription, LivenessTracker, subscription_key
+from protocols.core.closing import Closing
 from protocols.core.names import check_identifier
 from protocols.topics import Topic, cache_size, liveliness_key
 from protocols.validation.codec import encode, parse_key

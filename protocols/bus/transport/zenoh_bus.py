@@ -17,11 +17,12 @@ import zenoh.ext
 import zenoh.handlers
 from google.protobuf.message import Message
 
-from protocols.bus.base import BusDead, Closing, Received
+from protocols.bus.base import BusDead, Received
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.backfill import MOST_PART, NEWEST, SILENCE_S, Backfill, RecoveryQuery
 from protocols.bus.transport.inbox import Arrived, InboxSubscription, LivenessTracker, subscription_key
 from protocols.bus.transport.session import close_session, open_session, undeclare_all, zenoh_call
+from protocols.core.closing import Closing
 from protocols.core.names import check_identifier
 from protocols.topics import Delivery, Topic, cache_size, liveliness_key
 from protocols.validation.codec import encode, message_class, parse_key, unknown_key

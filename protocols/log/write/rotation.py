@@ -7,8 +7,8 @@ from pathlib import Path
 
 from google.protobuf.message import Message
 
-from protocols.bus.base import Closing
 from protocols.core.clocks import NANOSECONDS
+from protocols.core.closing import Closing
 from protocols.core.errors import InputError
 from protocols.log.layout import part_path
 from protocols.log.write.writer import LogWriter

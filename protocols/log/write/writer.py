@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
-from protocols.bus.base import Closing
+from protocols.core.closing import Closing
 from protocols.core.errors import InputError
 from protocols.core.version import VERSION
 from protocols.log.layout import CHANNEL_RECORD, FORMAT_RECORD, LOG_VERSION, channel_record, schema_of, with_checksum
