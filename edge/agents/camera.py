@@ -17,7 +17,8 @@ from google.protobuf.message import Message
 
 from edge.agents.clock_quality import ClockMonitor
 from edge.agents.image_health import ImageHealth
-from edge.agents.publish_queue import THUMBNAIL_WIDTH, PublishQueue, thumbnail_message
+from edge.agents.publish_queue import PublishQueue
+from edge.agents.thumbnails import THUMBNAIL_WIDTH, thumbnail_message
 from edge.detectors.base import Detection, Detector, Prediction
 from edge.devices.base import Device, Frame, Reconnecting
 from protocols.bus.base import Bus, Subscription, agent_status

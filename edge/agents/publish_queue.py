@@ -9,19 +9,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Self
 
-import cv2
 from google.protobuf.message import Message
 
-from edge.devices.base import Frame
 from protocols.bus.base import Bus, Publisher
-from protocols.core.jpeg import encode_jpeg
-from protocols.messages import syncline_pb2 as pb
 from protocols.topics import Topic
-from protocols.validation.rules import SCHEMA_VERSION
 
-THUMBNAIL_WIDTH = 320
-"""Default width of a thumbnail [px]: 8 kB as JPEG, so that fifty cameras fit a wireless link."""
-_JPEG_QUALITY = 70  # 8 kB at 320 px
 _FLUSH_S = 2.0  # for what is left at the end; a bus that hangs does not hold the process
 _POLL_S = 0.2  # between two looks whether the thread is to end
 _SUBSCRIBER_CHECK_S = 1.0  # between two checks of which topics have subscribers
@@ -105,24 +97,3 @@ class PublishQueue:
                     self.subscribed_topics = frozenset(one for one, out in publishers.items() if out.wait_matched(0.0))
         except Exception as error:  # noqa: BLE001 - re-raised in the thread that runs the agent
             self._error = error
-
-
-def thumbnail_message(frame: Frame, camera: str, boot_id: str, width: int = THUMBNAIL_WIDTH) -> pb.Picture:
-    """A frame as a JPEG of at most ``width`` px across; takes 1.5 ms for 1280x720."""
-    height, full = frame.image.shape[:2]
-    image = frame.image
-    if full > width:
-        # Subsample first: averaging over all pixels of a large image would cost more than the detector.
-        step = max(1, full // (2 * width))
-        size = (width, max(1, round(height * width / full)))
-        image = cv2.resize(image[::step, ::step], size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    return pb.Picture(
-        schema_version=SCHEMA_VERSION,
-        camera=camera,
-        boot_id=boot_id,
-        frame=frame.frame,
-        device_time_ns=frame.device_time_ns,
-        width=full,
-        height=height,
-        jpeg=encode_jpeg(image, _JPEG_QUALITY),
-    )

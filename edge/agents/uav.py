@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import Message
 
-from edge.agents.publish_queue import PublishQueue, thumbnail_message
+from edge.agents.publish_queue import PublishQueue
 from edge.agents.target_report import status_line, update_tracking_status
+from edge.agents.thumbnails import thumbnail_message
 from edge.agents.uav_guidance import FRAME_TIMEOUT_S, LINK_STALE_S, GuidanceControl
 from edge.agents.uav_settings import UavSettings
 from edge.detectors.base import Detector

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from edge.agents.publish_queue import THUMBNAIL_WIDTH
+from edge.agents.thumbnails import THUMBNAIL_WIDTH
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats
 

@@ -15,7 +15,7 @@ import pytest
 from deploy.agents.assembly import start_camera
 from deploy.config.agents import CameraConfig, LogConfig
 from edge import scenes
-from edge.agents.publish_queue import thumbnail_message
+from edge.agents.thumbnails import thumbnail_message
 from edge.detectors.marker.ball import MarkerDetector
 from edge.devices.base import Frame
 from edge.devices.playback.log_playback import LogPlayback

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge.agents.camera import CameraAgent
-from edge.agents.publish_queue import thumbnail_message
+from edge.agents.thumbnails import thumbnail_message
 from edge.devices.base import DeviceInfo, Frame
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.topics import OBSERVATION, PICTURE

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from deploy.logs.rerun_export import write_rrd
-from edge.agents.publish_queue import thumbnail_message
+from edge.agents.thumbnails import thumbnail_message
 from edge.devices.base import Frame
 from hub.view.player import LogRecording
 from protocols.geometry import so3

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.agents.publish_queue import thumbnail_message
+from edge.agents.thumbnails import thumbnail_message
 from edge.devices import camera as module
 from edge.devices.base import Frame
 from edge.devices.camera import open_camera
