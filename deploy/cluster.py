@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from deploy.offline.outputs import progress_bar
+from deploy.offline.progress import progress_bar
 from protocols.core.errors import EXIT_DONE, EXIT_INPUT, EXIT_REFUSED, InputError
 from protocols.core.files import check_folder, read_text, write_atomically
 from protocols.core.names import check_name

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,6 @@ from protocols.session.observations import Observations
 from protocols.session.rig import Rig, read_rig
 from protocols.session.session import Session
 
-Progress = Callable[[str, float], None]
-"""Called with what is done now and the share, 0..1, of the whole."""
 _ADVICE_OFFSET_STD_S = 0.002  # clock offset std above which advice is printed
 
 
@@ -179,22 +176,3 @@ def print_session(folder: Path, as_json: bool) -> None:
     console.print(table)
     for warning in description["warnings"]:
         console.print(f"warning: {warning}", soft_wrap=True)
-
-
-@contextmanager
-def progress_bar(title: str, quiet: bool = False) -> Iterator[Progress]:
-    """A bar moved by the yielded ``move(text, share)``, share 0..1; not drawn if standard error is not a terminal."""
-    if quiet or not sys.stderr.isatty():
-        yield lambda text, share: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(title, total=1.0)
-
-        def move(text: str, share: float) -> None:
-            progress.update(task, completed=share, description=f"{title}: {text}")
-
-        yield move

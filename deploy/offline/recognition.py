@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from deploy.offline.outputs import Progress
+from deploy.offline.progress import Progress
 from edge.detectors.base import Detector
 from edge.detectors.board.description import BOARD_FILE, Board, BoardKind, load_dictionary, read_board
 from edge.detectors.board.detector import SEARCH_PX, BoardDetector

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from deploy.offline.outputs import Progress
+from deploy.offline.progress import Progress
 from hub.api import CALIBRATION, RESULT, TRAJECTORY, calibrate, read_session
 from hub.report.time_figures import OffsetStdSample
 from protocols import topics

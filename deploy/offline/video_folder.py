@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 import tomli_w
 
-from deploy.offline.outputs import Progress
 from deploy.offline.people_session import read_people
+from deploy.offline.progress import Progress
 from deploy.offline.recognition import DETECTORS, Target, find_target
 from deploy.offline.single_target import rows_of_head_and_foot, rows_of_one_target, rows_of_unlabelled_people
 from edge.detectors import base as detector_base

@@ -9,7 +9,7 @@ from typing import Literal
 
 from deploy.agents.malloc_tuning import retain_freed_memory
 from deploy.commands.common import Flag, Json, Scheduler, check_seed, command_line
-from deploy.offline.outputs import progress_bar
+from deploy.offline.progress import progress_bar
 from hub import api
 from hub.api import CalibrationOptions, read_session
 from protocols.core.errors import EXIT_DONE, InputError, Refused

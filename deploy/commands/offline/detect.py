@@ -20,7 +20,7 @@ from deploy.commands.common import (
     parse_box,
     refuse,
 )
-from deploy.offline.outputs import progress_bar
+from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError, Refused
 from protocols.core.names import check_name, name_from_file
 

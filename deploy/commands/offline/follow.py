@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from deploy.commands.common import Json, NumberList, Scheduler, answer, check_range, closing_lines, command_line
-from deploy.offline.outputs import progress_bar
+from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import check_folder, write_together
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from deploy.commands.common import Flag, Json, UnusedSeed, answer, check_file, check_range, closing_lines, parse_size
-from deploy.offline.outputs import progress_bar
+from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError, Refused
 from protocols.core.names import check_name, name_from_file
 

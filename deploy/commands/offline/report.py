@@ -39,7 +39,7 @@ def report(
     browser
         Open the report in a browser.
     """
-    from deploy.offline.outputs import progress_bar
+    from deploy.offline.progress import progress_bar
     from deploy.offline.report_input import load_report_input
     from hub.report import build_report
     from hub.report.measures import row_usage

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from deploy.commands.common import Json, UnusedSeed, answer, check_range, closing_lines
-from deploy.offline.outputs import progress_bar
+from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError, Refused
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from deploy.commands.common import (
     check_seed,
     closing_lines,
 )
-from deploy.offline.outputs import progress_bar
+from deploy.offline.progress import progress_bar
 from protocols.core.errors import InputError
 from protocols.core.files import check_folder, remove_files, write_together
 

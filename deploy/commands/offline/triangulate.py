@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deploy.commands.common import Json, UnusedSeed, answer, check_file, closing_lines
-from deploy.offline.outputs import progress_bar
+from deploy.offline.progress import progress_bar
 
 if TYPE_CHECKING:
     from hub.api import TriangulationResult

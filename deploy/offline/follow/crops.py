@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from deploy.offline.outputs import Progress
+from deploy.offline.progress import Progress
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.kalman import LOG_SIZE, STATE_DIM
 from hub.tracking.filter.measurement import FOOT, HEAD, predict_measurement

@@ -16,7 +16,7 @@ from deploy.offline.follow.objects import (
     without_clock_steps,
 )
 from deploy.offline.follow.units import check_units
-from deploy.offline.outputs import Progress
+from deploy.offline.progress import Progress
 from hub.tracking.detections import TrackingCamera
 from hub.trajectory.image_tracks import MAX_PAUSE_S
 from protocols.core.clocks import NANOSECONDS

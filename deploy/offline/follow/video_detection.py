@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from deploy.offline.exchange.session_log import camera_info, write_observation_log
 from deploy.offline.follow.objects import Kind
-from deploy.offline.outputs import Progress
+from deploy.offline.progress import Progress
 from deploy.offline.video_folder import VideoFile, list_videos
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
