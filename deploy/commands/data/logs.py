@@ -25,7 +25,7 @@ def info(path: Path, /, *, json: Json = False, seed: UnusedSeed = 0) -> int:
     from protocols.log.read.session import is_log
 
     if path.is_dir() and not is_log(path):
-        from deploy.offline.outputs import print_session
+        from deploy.offline.session_info import print_session
 
         print_session(path, as_json=json)
         return EXIT_DONE
