@@ -252,17 +252,11 @@ def fit_spline(
     return solve_banded(bands, right)
 
 
-def split_at_gaps(time: Floats, max_gap: float, part: Ints | None = None) -> tuple[Floats, Floats]:
-    """Begins and ends of the stretches of sorted ``time`` (n,), split at gaps longer than ``max_gap``.
-
-    part: (n,) non-decreasing numbers; a stretch also ends where they change.
-    """
+def split_at_gaps(time: Floats, max_gap: float) -> tuple[Floats, Floats]:
+    """Begins and ends of the stretches of sorted ``time`` (n,), split at gaps longer than ``max_gap``."""
     if len(time) == 0:
         return np.zeros(0), np.zeros(0)
-    is_split = np.diff(time) > max_gap
-    if part is not None:
-        is_split |= np.diff(part) > 0
-    cuts = np.flatnonzero(is_split)
+    cuts = np.flatnonzero(np.diff(time) > max_gap)
     return time[np.r_[0, cuts + 1]], time[np.r_[cuts, len(time) - 1]]
 
 

@@ -1,8 +1,8 @@
 """Access control of the view's HTTP and WebSocket server: Host and Origin checks, and a token beyond loopback.
 
-Viser itself serves every client that reaches its port. On loopback every program of this machine has access, but no
-page of another site in the same browser: the request's Host must be this machine, and a WebSocket's Origin must equal
-it. Beyond loopback a token is required once in the address (``?token=…``) and kept as a cookie.
+Viser itself serves every client that reaches its port. On loopback every program of this machine has access, but
+no page of another site in the same browser: the request's Host must be this machine, and a WebSocket's Origin must
+equal it. Beyond loopback a token is required once in the address (``?token=…``) and kept as a cookie.
 """
 
 from __future__ import annotations

@@ -128,9 +128,6 @@ def _texture_test(
     return np.where(hidden, 255, 0).astype(np.uint8), np.where(shown, 255, 0).astype(np.uint8)
 
 
-Box = tuple[float, float, float, float]
-
-
 def remove_ghosts(foreground: Image, now: Image, then: Image, where: Image) -> Image:
     """A mask (H, W) 0/255 with 0 wherever ``where`` is 255 and two images (H, W, 3) are equal within noise."""
     step = GHOST_STEP - 1
@@ -138,7 +135,7 @@ def remove_ghosts(foreground: Image, now: Image, then: Image, where: Image) -> I
     return np.asarray(cv2.bitwise_and(foreground, cv2.bitwise_not(cv2.bitwise_and(like, where))), dtype=np.uint8)
 
 
-def slices(box: Box, shape: tuple[int, ...]) -> tuple[slice, slice]:
+def slices(box: tuple[float, float, float, float], shape: tuple[int, ...]) -> tuple[slice, slice]:
     x, y, w, h = box
     left, top = max(math.floor(x), 0), max(math.floor(y), 0)
     return slice(top, min(math.ceil(y + h), shape[0])), slice(left, min(math.ceil(x + w), shape[1]))
