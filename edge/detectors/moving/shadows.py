@@ -141,7 +141,7 @@ def slices(box: tuple[float, float, float, float], shape: tuple[int, ...]) -> tu
     return slice(top, min(math.ceil(y + h), shape[0])), slice(left, min(math.ceil(x + w), shape[1]))
 
 
-def is_ghost(image: Image, background: Image, box: Box, foreground: Image) -> bool:
+def is_ghost(image: Image, background: Image, box: tuple[float, float, float, float], foreground: Image) -> bool:
     """Whether a silhouette is a ghost: its rim has a higher contrast in the background than in the image.
 
     A ghost is the former place of an object that was learnt as background and has left.
