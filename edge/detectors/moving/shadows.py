@@ -128,6 +128,9 @@ def _texture_test(
     return np.where(hidden, 255, 0).astype(np.uint8), np.where(shown, 255, 0).astype(np.uint8)
 
 
+Box = tuple[float, float, float, float]
+
+
 def remove_ghosts(foreground: Image, now: Image, then: Image, where: Image) -> Image:
     """A mask (H, W) 0/255 with 0 wherever ``where`` is 255 and two images (H, W, 3) are equal within noise."""
     step = GHOST_STEP - 1
@@ -135,13 +138,13 @@ def remove_ghosts(foreground: Image, now: Image, then: Image, where: Image) -> I
     return np.asarray(cv2.bitwise_and(foreground, cv2.bitwise_not(cv2.bitwise_and(like, where))), dtype=np.uint8)
 
 
-def slices(box: tuple[float, float, float, float], shape: tuple[int, ...]) -> tuple[slice, slice]:
+def slices(box: Box, shape: tuple[int, ...]) -> tuple[slice, slice]:
     x, y, w, h = box
     left, top = max(math.floor(x), 0), max(math.floor(y), 0)
     return slice(top, min(math.ceil(y + h), shape[0])), slice(left, min(math.ceil(x + w), shape[1]))
 
 
-def is_ghost(image: Image, background: Image, box: tuple[float, float, float, float], foreground: Image) -> bool:
+def is_ghost(image: Image, background: Image, box: Box, foreground: Image) -> bool:
     """Whether a silhouette is a ghost: its rim has a higher contrast in the background than in the image.
 
     A ghost is the former place of an object that was learnt as background and has left.
