@@ -291,27 +291,19 @@ def _check_repeats(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DetectionRows:
+class DetectionRows(ObservationRows):
     """n detections in the file's order; NaN = not measured.
 
-    camera, label, kind: n texts, kind "" = not given. frame: (n,). time: (n,) [s] on the camera's clock. pixels: (n, 2)
-    (u, v). size: (n,) [px]. score: (n,) 0..1. covariance: (n, 3) uu, uv, vv [px²]. head, foot: (n, 2) [px]. box: (n, 4)
-    x, y, w, h [px], x and y of the top left. line: n line numbers of the file.
+    kind: n texts, "" = not given. score: (n,) 0..1. covariance: (n, 3) uu, uv, vv [px²]. head, foot: (n, 2) [px]. box:
+    (n, 4) x, y, w, h [px], x and y of the top left.
     """
 
-    camera: list[str]
-    label: list[str]
     kind: list[str]
-    frame: Ints
-    time: Floats
-    pixels: Floats
-    size: Floats
     score: Floats
     covariance: Floats
     head: Floats
     foot: Floats
     box: Floats
-    line: list[int]
 
     def __len__(self) -> int:
         return len(self.time)
@@ -341,19 +333,19 @@ def read_detections(file: Path, sizes: Mapping[str, tuple[int, int]]) -> Detecti
     outside = ((box[:, :2] >= limit) | (box[:, :2] + box[:, 2:] <= 0.0)).any(axis=1)
     rows.table.refuse(outside, lambda row: f"the box lies outside the {limit[row, 0]:g}x{limit[row, 1]:g} image")
     return DetectionRows(
+        rows.table,
         rows.camera,
         rows.label,
-        _kinds(rows),
         rows.frame,
         rows.time,
         rows.pixels,
         rows.size,
+        read_kinds(rows.table),
         score,
         covariance,
         head,
         foot,
         box,
-        rows.table.line,
     )
 
 
@@ -384,11 +376,12 @@ def _together(rows: ObservationRows, names: tuple[str, ...], limit: float = 1e6)
     return values
 
 
-def _kinds(rows: ObservationRows) -> list[str]:
-    if "kind" not in rows.table.columns:
-        return [""] * len(rows.table)
-    kinds = rows.table.text("kind")
+def read_kinds(table: CsvTable) -> list[str]:
+    """The kinds (n,) of a table's rows; "" = not given. Raises InputError for an unknown one."""
+    if "kind" not in table.columns:
+        return [""] * len(table)
+    kinds = table.text("kind")
     unknown = np.array([kind not in KINDS for kind in kinds])
     remedy = f"use one of {', '.join(KINDS[1:])}, or leave it empty"
-    rows.table.refuse(unknown, lambda row: f"kind {kinds[row][:40]!r} is not known", remedy)
+    table.refuse(unknown, lambda row: f"kind {kinds[row][:40]!r} is not known", remedy)
     return kinds
