@@ -10,14 +10,8 @@ from typing import Any
 
 from edge.mavlink.dialect import AUTOPILOT, CAMERA, camera_heartbeat, mavlink, message_name
 from edge.mavlink.link.connection import Link, ReceivedMessage
-from edge.mavlink.roles.camera_messages import (
-    STREAM_ID,
-    UNKNOWN_INT,
-    CameraMessages,
-    MessageRates,
-    TrackingStatus,
-    VideoStream,
-)
+from edge.mavlink.roles.camera_messages import STREAM_ID, UNKNOWN_INT, CameraMessages, TrackingStatus, VideoStream
+from edge.mavlink.roles.message_rates import MessageRates
 from protocols.geometry.camera import Intrinsics
 
 _HELD_S = 0.5  # a shorter absence is no news

@@ -13,7 +13,8 @@ from edge.mavlink.dialect import mavlink
 from edge.mavlink.link.connection import Link
 from edge.mavlink.roles import camera as camera_role
 from edge.mavlink.roles.camera import ArmFollow, CameraComponent, OperatorCommand, SelectTarget, StopTracking
-from edge.mavlink.roles.camera_messages import MessageRates, VideoStream
+from edge.mavlink.roles.camera_messages import VideoStream
+from edge.mavlink.roles.message_rates import MessageRates
 from protocols.geometry.camera import Intrinsics
 from tests.support.pipe import Pipe
 
