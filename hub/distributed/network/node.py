@@ -25,15 +25,8 @@ from hub.distributed.network.block_solver import (
     relative_transform,
     retract,
 )
-from hub.distributed.network.datum import (
-    Neighbour,
-    accepted_anchors,
-    control_point_factor,
-    find_outliers,
-    localise,
-    localise_by_resection,
-    world_from_network,
-)
+from hub.distributed.network.datum import accepted_anchors, control_point_factor, find_outliers, world_from_network
+from hub.distributed.network.localisation import Neighbour, localise, localise_by_resection
 from hub.distributed.network.messages import (
     Anchor,
     ControlPoint,
