@@ -20,13 +20,8 @@ import numpy as np
 
 from hub.bundle.preprocessing import PreparedSession
 from hub.bundle.problem import LARGE_NETWORK
-from hub.calibration.pairs.synchronised_groups import (
-    ENOUGH_PAIRS,
-    MIN_REDUNDANT,
-    SynchronisedGroups,
-    candidate_pairs,
-    time_span,
-)
+from hub.calibration.pairs.pair_overlap import candidate_pairs
+from hub.calibration.pairs.synchronised_groups import ENOUGH_PAIRS, MIN_REDUNDANT, SynchronisedGroups, time_span
 from hub.clocks.clock_graph import connected_components
 from hub.clocks.external_prior import MAX_CAMERA_DELAY_S, ExternalClockPrior
 from hub.sync.common_clock import solve_common_clock_pair

@@ -13,7 +13,7 @@ from hub.bundle.preprocessing import PreparedSession, prepare
 from hub.bundle.problem import LARGE_NETWORK
 from hub.calibration.pairs import pair_network
 from hub.calibration.pairs.pair_network import solve_pairs
-from hub.calibration.pairs.synchronised_groups import candidate_pairs
+from hub.calibration.pairs.pair_overlap import candidate_pairs
 from hub.clocks.clock_graph import connected_components
 from hub.sync.hypothesis import PairSolution
 from tests.support.long_street import street
@@ -52,7 +52,7 @@ def test_small_networks_and_unknown_clocks_have_all_their_pairs() -> None:
 
 
 def test_the_chosen_pairs_connect_all_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hub.calibration.pairs.synchronised_groups.LARGE_NETWORK", 4)
+    monkeypatch.setattr("hub.calibration.pairs.pair_overlap.LARGE_NETWORK", 4)
     monkeypatch.setattr(pair_network, "LARGE_NETWORK", 4)
     rig, observations, arrivals, *_ = street(5, cameras=9, seconds=40.0)
     solve, searches = pair_network._solve, Counter[tuple[str, str]]()
