@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from hub.report.svg import THIN, drawing, esc, line, number, points, rect, short, text
-from hub.view.state import LAG_WINDOW_S, CameraView, LagSample, ViewState
+from hub.view.lag_history import LAG_WINDOW_S, LagSample
+from hub.view.state import CameraView, ViewState
 from protocols.geometry.types import Floats
 
 _LAG_WIDTH, _RMS_LEFT, _RMS_WIDTH, _HEIGHT = 232.0, 248.0, 92.0, 56.0  # px of the drawing

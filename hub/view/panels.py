@@ -9,7 +9,8 @@ import math
 from hub.calibration.coverage import MIN_COVERAGE
 from hub.report.measures import COLUMNS, ROWS
 from hub.report.svg import at, drawing
-from hub.view.state import STALE_S, AgentView, CameraState, CameraView, PathView, ViewState, lag_of
+from hub.view.lag_history import lag_of
+from hub.view.state import STALE_S, AgentView, CameraState, CameraView, PathView, ViewState
 from protocols.core.jpeg import jpeg_fits
 
 SIGNS: dict[CameraState, str] = {

@@ -11,7 +11,8 @@ import numpy as np
 from google.protobuf.message import Message
 
 from hub.live.messages import calibration_message, track_messages
-from hub.view.state import LAG_WINDOW_S, LATCHED, ON_IMAGES, TOPICS, ViewState
+from hub.view.lag_history import LAG_WINDOW_S
+from hub.view.state import LATCHED, ON_IMAGES, TOPICS, ViewState
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.log.read.reader import LogReader

@@ -9,12 +9,13 @@ import itertools
 import re
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from google.protobuf.message import Message
 
 from hub.calibration.coverage import CoverageMonitor
+from hub.view.lag_history import LagHistory
 from hub.view.uav_overlay import UavView
 from protocols import topics
 from protocols.core.clocks import NANOSECONDS
@@ -22,9 +23,6 @@ from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.messages import syncline_pb2 as pb
 
-LAG_WINDOW_S = 300.0
-"""Samples older than this are not shown [s]."""
-_MAX_SAMPLES = 600  # two a second over the window
 SILENT_S = 2.0
 """A camera without a frame for longer than this is silent."""
 STALE_S = 5.0
@@ -51,45 +49,6 @@ LATCHED = (topics.CAMERA_INFO, topics.CALIBRATION, topics.STATUS, topics.UAV_INF
 """Topics of which the last message of each sender is valid until it is replaced."""
 TOPICS = (*LATCHED, topics.OBSERVATION, topics.TRACK, topics.TARGET)
 ON_IMAGES = (topics.TARGET_CLOUD, topics.ROAD_MAP)
-
-
-def lag_of(found: pb.CameraCalibration) -> float:
-    """Reference time less camera time [s], at the camera time that the std holds for."""
-    return (found.clock_rate - 1.0) * found.lag_time_s + found.time_offset
-
-
-class LagSample(NamedTuple):
-    """One published calibration of a camera. at: the view's time [s]. lag: reference time less camera time, at the
-    camera time that the std holds for, less the first published lag [s]."""
-
-    at: float
-    lag: float
-    std: float
-    rms_px: float
-
-
-class LagHistory:
-    """The published lags of one camera; they start again when its clock or the reference clock is another one.
-
-    first: the lag [s] that the samples are differences to.
-    """
-
-    def __init__(self) -> None:
-        self.samples: deque[LagSample] = deque(maxlen=_MAX_SAMPLES)
-        self.first = 0.0
-        self._clocks: tuple[str, ...] = ()
-
-    def add(self, found: pb.CameraCalibration, clocks: tuple[str, ...], now: float) -> None:
-        """Add a new revision. clocks: what the lag is between, such as boot ids."""
-        lag = lag_of(found)
-        if clocks != self._clocks:
-            self.samples.clear()
-            self._clocks, self.first = clocks, lag
-        self.samples.append(LagSample(now, lag - self.first, found.time_offset_std, found.rms_px))
-
-    def recent(self, now: float) -> list[LagSample]:
-        """The samples of the shown window."""
-        return [sample for sample in self.samples if sample.at > now - LAG_WINDOW_S]
 
 
 @dataclass(slots=True, eq=False)

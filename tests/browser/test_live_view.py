@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from hub.view.state import lag_of
+from hub.view.lag_history import lag_of
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 from protocols.log.read.reader import LogReader

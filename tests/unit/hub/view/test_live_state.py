@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from hub.view.lag_chart import lag_charts
+from hub.view.lag_history import LAG_WINDOW_S, LagHistory
 from hub.view.panels import camera_details, camera_table, overview, picture_tiles, recording_html, track_text
 from hub.view.player import LogRecording, Player
 from hub.view.scene_renderer import trail_segments
-from hub.view.state import LAG_WINDOW_S, STALE_S, LagHistory, ViewState
+from hub.view.state import STALE_S, ViewState
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.topics import CALIBRATION, OBSERVATION
