@@ -1,4 +1,4 @@
-"""Commands of Syncline as child processes, each with a log of its output; a demo's agents, stopped in order."""
+"""Commands of Syncline as child processes, each with a log, stopped in order; termination of a process on signals."""
 
 from __future__ import annotations
 

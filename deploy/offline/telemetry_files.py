@@ -1,4 +1,4 @@
-"""Telemetry files with their own clock (.tlog, Syncline's .mcap), aligned to a video's clock by its image motion."""
+"""Telemetry files with their own clock (.tlog, .mcap), aligned to a video by its image motion; a log's images."""
 
 from __future__ import annotations
 

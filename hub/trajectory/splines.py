@@ -1,4 +1,4 @@
-"""Uniform cubic B-splines over disjoint stretches of time, and their banded least-squares fit.
+"""Uniform cubic B-splines over disjoint stretches of time, their banded least-squares fit, and Cholesky factors.
 
 One basis serves the smoothing of image tracks (`hub.trajectory.image_tracks`) and the 3-D trajectories of the bundle
 adjustment (`hub.bundle`). A stretch is a time span without long gaps; each has its own control points, and all
@@ -260,6 +260,7 @@ def split_at_gaps(time: Floats, max_gap: float) -> tuple[Floats, Floats]:
     return time[np.r_[0, cuts + 1]], time[np.r_[cuts, len(time) - 1]]
 
 
+# LAPACK's routines without the checks of scipy's wrappers, which take as long again.
 def cholesky_banded(band: Floats) -> Floats:
     """Upper band (k, n) of the factor U, ``A = Uᵀ U``, of the upper band of A. Raises LinAlgError if not definite."""
     factor, info = dpbtrf(band) if band.size else (band, 0)

@@ -1,4 +1,4 @@
-"""The view server and its loops between the bus, or a recording, and the browser."""
+"""The view server, who has access to it, and its loops between the bus, or a recording, and the browser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bus interface that agents use. Two implementations: Zenoh and in-memory."""
+"""The bus interface that agents use. Two implementations: Zenoh and in-memory. Commands of an operator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Camera intrinsics: pinhole with OpenCV's distortion, and OpenCV's fisheye model.
+"""Camera intrinsics: pinhole with OpenCV's distortion, and OpenCV's fisheye model; the bias of a sphere's contour.
 
 Camera axes: x right, y down, z forward. Pixels are OpenCV's: (0, 0) is the centre of the top-left
 pixel. ``normalised`` coordinates are (x/z, y/z) without distortion.

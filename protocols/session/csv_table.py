@@ -1,4 +1,4 @@
-"""CSV files of numbers with named columns; every mistake is reported with file, line and remedy."""
+"""CSV files of numbers with named columns, mistakes with file, line and remedy; tables for notebooks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The observations of a session: pixel tracks of moving points with capture times on each camera's own clock."""
+"""The observations of a session: pixel tracks of moving points with capture times on each camera's own clock.
+
+Where identities are not known, several rows of one camera, time and label are several objects: tracking reads these
+as ``DetectionRows``, with all columns that `syncline detect` writes; synchronisation and calibration read tracks.
+"""
 
 from __future__ import annotations
 

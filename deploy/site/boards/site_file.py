@@ -1,4 +1,4 @@
-"""site.toml: every agent of a site, where it runs, and the configuration that agents of a role share."""
+"""site.toml: every agent of a site, where it runs, what agents of a role share; files for its monitoring."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Playback of a video file or an image folder as a device."""
+"""Playback of recordings as devices: what all share, and a video file or an image folder."""
 
 from __future__ import annotations
 

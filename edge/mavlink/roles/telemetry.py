@@ -1,4 +1,4 @@
-"""An autopilot's MAVLink telemetry (attitude, position, gimbal, clock) in SI units and rotation matrices."""
+"""An autopilot's MAVLink telemetry in SI units and rotation matrices, and one local frame for its positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Re-identification: a target that reappears gets its former track number, by colour, size and motion."""
+"""Re-identification: reappearing targets get their former track numbers; which track's future is another's past."""
 
 from __future__ import annotations
 
