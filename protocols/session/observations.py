@@ -336,8 +336,8 @@ def read_detections(file: Path, sizes: Mapping[str, tuple[int, int]]) -> Detecti
     limit = np.array([sizes[name] for name in rows.camera], dtype=np.float64).reshape(-1, 2)
     outside = ((box[:, :2] >= limit) | (box[:, :2] + box[:, 2:] <= 0.0)).any(axis=1)
     rows.table.refuse(outside, lambda row: f"the box lies outside the {limit[row, 0]:g}x{limit[row, 1]:g} image")
-    columns = (getattr(rows, name) for name in ObservationRows.__slots__)
-    return DetectionRows(*columns, read_kinds(rows.table), score, covariance, head, foot, box)
+    columns = [getattr(rows, name) for name in ObservationRows.__slots__]
+    return DetectionRows(*[*columns, read_kinds(rows.table), score, covariance, head, foot, box])
 
 
 def swapped_ends(head: Floats, foot: Floats, camera: Sequence[str]) -> Bools:
