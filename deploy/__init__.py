@@ -14,9 +14,9 @@ __all__ = ["people_session", "run", "session_from_videos", "write_simulated_sess
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "people_session": "deploy.offline.people_session",
-        "run": "deploy.cli",
-        "session_from_videos": "deploy.offline.video_folder",
-        "write_simulated_session": "deploy.simulation.session",
+        "deploy.cli": ["run"],
+        "deploy.offline.people_session": ["people_session"],
+        "deploy.offline.video_folder": ["session_from_videos"],
+        "deploy.simulation.session": ["write_simulated_session"],
     },
 )

@@ -15,12 +15,10 @@ __all__ = ["Detection", "Detector", "DetectorOptions", "Frame", "detect_video", 
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "Detection": "edge.detectors.base",
-        "Detector": "edge.detectors.base",
-        "DetectorOptions": "edge.detectors.base",
-        "Frame": "edge.devices.base",
-        "detect_video": "edge.offline.video",
-        "load_detector": "edge.detectors.plugins",
-        "open_camera": "edge.devices.camera",
+        "edge.detectors.base": ["Detection", "Detector", "DetectorOptions"],
+        "edge.detectors.plugins": ["load_detector"],
+        "edge.devices.base": ["Frame"],
+        "edge.devices.camera": ["open_camera"],
+        "edge.offline.video": ["detect_video"],
     },
 )

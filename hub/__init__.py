@@ -12,11 +12,7 @@ __all__ = ["CalibrationOptions", "CalibrationResult", "TriangulationResult", "bu
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "CalibrationOptions": "hub.api",
-        "CalibrationResult": "hub.api",
-        "TriangulationResult": "hub.api",
-        "build_report": "hub.report",
-        "calibrate": "hub.api",
-        "triangulate": "hub.api",
+        "hub.api": ["CalibrationOptions", "CalibrationResult", "TriangulationResult", "calibrate", "triangulate"],
+        "hub.report": ["build_report"],
     },
 )

@@ -17,7 +17,6 @@ import numpy as np
 
 from protocols.core.errors import InputError, Refused
 from protocols.core.files import check_folder, remove_files, write_atomically, write_together
-from protocols.core.tables import dataframe
 from protocols.geometry import so3
 from protocols.log.read.session import is_log, load_session, no_session
 from protocols.session.calibration import (
@@ -29,6 +28,7 @@ from protocols.session.calibration import (
     read_calibration,
     trajectory_text,
 )
+from protocols.session.csv_table import dataframe
 from protocols.session.folder import RIG_FILE, labelled_file
 from protocols.session.observations import Observations, read_observations
 from protocols.session.result import refusal_document, result_document, result_text
@@ -208,6 +208,17 @@ def calibrate(
         remedy = "leave --from-known and --solver out"
         raise InputError("--refine-lenses goes with --solver joint and without --from-known", remedy=remedy)
     session = session if isinstance(session, Session) else read_session(session)
+    began = time.process_time()
+    try:
+        found = _calibrated(session, options, progress)
+    except Refused as refused:
+        refused.cpu_seconds = time.process_time() - began
+        raise
+    return replace(found, calibration=replace(found.calibration, cpu_seconds=time.process_time() - began))
+
+
+def _calibrated(session: Session, options: CalibrationOptions, progress: Progress | None) -> CalibrationResult:
+    """The calibration by labelled points, by unlabelled people, or by what calibrates more cameras."""
     if not isinstance(session, RecordedSession) or not session.people:
         return _from_labels(session, options, progress)
     if not len(session.observations) or any(bar[:2] == ("head", "foot") for bar in session.rig.scale_bars):
@@ -215,16 +226,10 @@ def calibrate(
     from hub.calibration.people.ways import first_complete
 
     ways = (_from_labels, _from_people) if _suits_people(options) else (_from_labels,)
-    began = time.process_time()
-    try:
-        best = first_complete(
-            [partial(way, session, options, progress) for way in ways],
-            {message.camera for message in session.people} & session.rig.cameras.keys(),
-        )
-    except Refused as refused:
-        refused.cpu_seconds = time.process_time() - began
-        raise
-    return replace(best, calibration=replace(best.calibration, cpu_seconds=time.process_time() - began))
+    return first_complete(
+        [partial(way, session, options, progress) for way in ways],
+        {message.camera for message in session.people} & session.rig.cameras.keys(),
+    )
 
 
 def _suits_people(options: CalibrationOptions) -> bool:
@@ -242,7 +247,6 @@ def _from_labels(session: Session, options: CalibrationOptions, progress: Progre
     if options.from_known is not None:
         known, rig = _fixed(Path(options.from_known), session.rig)
         session = replace(session, rig=rig)
-    began = time.process_time()
     read, session = session, _with_associated_people(session, progress, known)
 
     def estimated(session: Session, known: FixedCalibration | None) -> Calibration:
@@ -279,13 +283,11 @@ def _from_labels(session: Session, options: CalibrationOptions, progress: Progre
 
             refused.reason = meant_convention(known.cameras, fitting) or refused.reason
         refused.warnings = (*session.warnings, *refused.warnings)
-        refused.cpu_seconds = time.process_time() - began
         raise
-    spent = time.process_time() - began
     if known is not None:
         speed = unlikely_speed(found.scale, found.units, found.trajectories)
         found = replace(found, warnings=(*found.warnings, *speed))
-    return CalibrationResult(replace(found, cpu_seconds=spent, warnings=session.warnings + found.warnings), session)
+    return CalibrationResult(replace(found, warnings=session.warnings + found.warnings), session)
 
 
 def _from_people(session: RecordedSession, options: CalibrationOptions, progress: Progress | None) -> CalibrationResult:
@@ -295,17 +297,15 @@ def _from_people(session: RecordedSession, options: CalibrationOptions, progress
     if not _suits_people(options):
         what = "unlabelled people go with --solver joint, without --from-known and --refine-lenses"
         raise InputError(what, remedy="leave these out, or label the people: one label a person in all cameras")
-    began = time.process_time()
     try:
         found, observations = calibrate_people(
             session.rig, session.people, progress, priors=session.clock_priors, seed=options.seed
         )
     except Refused as refused:
-        refused.warnings, refused.cpu_seconds = session.warnings, time.process_time() - began
+        refused.warnings = session.warnings
         raise
-    spent, warnings = time.process_time() - began, session.warnings + found.warnings
     read = replace(session, observations=observations)
-    return CalibrationResult(replace(found, cpu_seconds=spent, warnings=warnings), read)
+    return CalibrationResult(replace(found, warnings=session.warnings + found.warnings), read)
 
 
 def _with_associated_people(session: Session, progress: Progress | None, known: FixedCalibration | None) -> Session:

@@ -15,12 +15,10 @@ __all__ = ["InputError", "Refused", "Session", "SynclineError", "load_session", 
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "InputError": "protocols.core.errors",
-        "Refused": "protocols.core.errors",
-        "Session": "protocols.session.session",
-        "SynclineError": "protocols.core.errors",
-        "load_session": "protocols.log.read.session",
-        "read_calibration": "protocols.session.calibration",
-        "read_rig": "protocols.session.rig",
+        "protocols.core.errors": ["InputError", "Refused", "SynclineError"],
+        "protocols.log.read.session": ["load_session"],
+        "protocols.session.calibration": ["read_calibration"],
+        "protocols.session.rig": ["read_rig"],
+        "protocols.session.session": ["Session"],
     },
 )

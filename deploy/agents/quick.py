@@ -59,13 +59,11 @@ class LastFrameDevice(WrappedDevice):
         return replace(info, intrinsics=lens)
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The next frame."""
         frame = super().read(timeout_s)
         self.frame = frame or self.frame
         return frame
 
     def close(self) -> None:
-        """Release the device."""
         super().close()
         self.done = True
 

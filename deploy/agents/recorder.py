@@ -21,8 +21,7 @@ import msgspec
 from deploy.agents.retention import RESUME_MARGIN, Retention, Space, free_bytes, unused_log_path
 from deploy.config.agents import RecorderConfig
 from deploy.config.file import effective_toml
-from protocols.bus.base import Bus, Received, Subscription, agent_status
-from protocols.bus.commands import CommandSubscription
+from protocols.bus.base import Bus, CommandSubscription, Received, Subscription, agent_status
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import EXIT_DONE, InputError
 from protocols.core.version import VERSION

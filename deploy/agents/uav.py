@@ -23,7 +23,6 @@ from protocols.geometry.types import Floats
 if TYPE_CHECKING:
     from edge.devices.simulated.aircraft import SimulatedAircraft
     from edge.mavlink.link.connection import Link
-    from edge.mavlink.roles.autopilot import Autopilot
     from edge.mavlink.roles.camera import CameraComponent, OperatorCommand
     from edge.mavlink.roles.camera_messages import VideoStream
     from edge.uav.base import Estimate
@@ -97,7 +96,6 @@ class SimulatedFlight:
 
     world: FlightWorld
     aircraft: SimulatedAircraft
-    autopilot: Autopilot | None = None
 
 
 def start_uav(config: UavConfig, bus: Bus, stop: threading.Event, beat: Callable[[], None] | None = None) -> int:

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deploy.agents.processes import START_TIMEOUT_S, AgentProcesses, free_udp_port
-from deploy.agents.signals import interrupt_on_signals
+from deploy.agents.processes import START_TIMEOUT_S, AgentProcesses, free_udp_port, interrupt_on_signals
 from deploy.config.uav import SimulatedFlightConfig
 from deploy.demo.flight_outcome import (
     LOG,

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from deploy.agents.processes import START_TIMEOUT_S, AgentProcesses, last_line
-from deploy.agents.signals import interrupt_on_signals
+from deploy.agents.processes import START_TIMEOUT_S, AgentProcesses, interrupt_on_signals, last_line
 from protocols.bus.base import Bus
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig

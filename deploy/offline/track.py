@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.devices.playback.base import Playback
+from edge.devices.playback.video_file import Playback
 from edge.devices.playback.video_reader import image_files
 from edge.uav.base import Basis, Box, Estimate, Telemetry, Tracker, TrackState
 from edge.uav.georeference import Georeference

@@ -99,12 +99,10 @@ class WrappedDevice:
 
     @property
     def info(self) -> DeviceInfo:
-        """The device's."""
         return self._device.info
 
     @property
     def ended(self) -> bool:
-        """The device's."""
         return self._device.ended
 
     @property
@@ -114,24 +112,19 @@ class WrappedDevice:
 
     @property
     def reconnections(self) -> int:
-        """The device's."""
         return self._device.reconnections if isinstance(self._device, Reconnecting) else 0
 
     @property
     def temperature(self) -> float | None:
-        """The device's temperature [°C]; None if it does not measure one."""
         return self._device.temperature if isinstance(self._device, Reconnecting) else None
 
     def open(self) -> None:
-        """Open the device."""
         self._device.open()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """The device's next frame."""
         return self._device.read(timeout_s)
 
     def close(self) -> None:
-        """Close the device."""
         self._device.close()
 
 

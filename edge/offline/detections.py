@@ -17,9 +17,9 @@ from edge.detectors.base import BatchDetector, Detection, Detector
 from edge.devices.playback.video_reader import VideoFrame, VideoReader
 from protocols.core.errors import InputError
 from protocols.core.files import write_together
-from protocols.core.tables import dataframe
 from protocols.session.calibration import csv_cell
-from protocols.session.detections import COLUMNS
+from protocols.session.csv_table import dataframe
+from protocols.session.observations import COLUMNS
 
 if TYPE_CHECKING:
     import pandas

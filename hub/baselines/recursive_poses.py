@@ -70,11 +70,6 @@ def correlation(unit_k: Floats, unit_l: Floats) -> Floats:
     return np.asarray(unit_k.T @ unit_l)
 
 
-def rotation_of(matrix: Floats) -> Floats:
-    """The rotation (3, 3) that maximises its trace with ``matrix``; minimises eqs. (1), (18)."""
-    return so3.nearest(matrix)
-
-
 def direction(mean_k: Floats, mean_l: Floats, k_from_l: Floats) -> Floats:
     """y_kl = R_k (t_l - t_k) (3,) in the unit of the means; eq. (16) solved."""
     return np.asarray(mean_k - k_from_l @ mean_l)
@@ -179,7 +174,7 @@ class RecursivePoseNode:
                 edge.matrix = discounted_sum(edge.matrix, edge.new_correlation, self.settings.forget)
                 edge.new_correlation = np.zeros((3, 3))
         matrix = attitude_matrix(self.known, [(edge.matrix, poses[k][0].rotation) for k, edge in ready.items()])
-        self.rotation = rotation_of(matrix)
+        self.rotation = so3.nearest(matrix)  # maximises the trace of eqs. (1), (18)
         for k in latest:
             if k not in ready or self.position_known:
                 continue

@@ -16,9 +16,8 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from hub.bundle.block_matrix import BlockSum
-from hub.trajectory.banded import cho_solve_banded, cholesky_banded, solve_upper_transposed
 from hub.trajectory.discrete import PointBasis
-from hub.trajectory.splines import SUPPORT, SplineBasis
+from hub.trajectory.splines import SUPPORT, SplineBasis, cho_solve_banded, cholesky_banded, solve_upper_transposed
 from protocols.geometry import kernels
 from protocols.geometry.types import Floats, Ints
 

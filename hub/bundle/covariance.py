@@ -15,8 +15,7 @@ from hub.bundle.bordered_system import BAND, Elimination, PathByCameras, elimina
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import CAMERA_PARAMETERS, LARGE_NETWORK, AdjustmentState, Column, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior, deformation_terms
-from hub.trajectory.banded import cho_solve_banded
-from hub.trajectory.splines import SUPPORT, weighted_sums
+from hub.trajectory.splines import SUPPORT, cho_solve_banded, weighted_sums
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats, Ints

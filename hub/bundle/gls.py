@@ -30,9 +30,8 @@ from hub.bundle.problem import (
 )
 from hub.bundle.residuals import evaluate_residuals, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, smoothness_cost, smoothness_terms
-from hub.trajectory.banded import cho_solve_banded, cholesky_banded
 from hub.trajectory.discrete import PointBasis
-from hub.trajectory.splines import SUPPORT
+from hub.trajectory.splines import SUPPORT, cho_solve_banded, cholesky_banded
 from protocols.geometry.types import Floats, Ints
 
 _KNOTS_PER_TIME_CONSTANT, _MIN_KNOTS_PER_TIME_CONSTANT = 8.0, 2.0  # of a correlated error, per time constant

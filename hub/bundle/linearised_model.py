@@ -21,7 +21,7 @@ from hub.bundle.normal_equations import assemble, build_system, weigh_residuals
 from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, ClockStep, Column, Problem
 from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians
 from hub.bundle.smoothness_prior import SmoothnessPrior, estimate_smoothness
-from hub.trajectory.banded import cho_solve_banded
+from hub.trajectory.splines import cho_solve_banded
 from protocols.geometry.types import Floats, Ints
 
 _STEP_SHARES = (1.0, 0.5)

@@ -11,8 +11,7 @@ from hub.bundle.initialisation import MIN_KNOT_SPACING, CameraInput
 from hub.bundle.problem import LensPrior, TrackObservations
 from hub.trajectory.discrete import sampled_track
 from hub.trajectory.image_tracks import ImageTrack, SmoothTrack, smooth_track, without_clock_steps
-from protocols.geometry.camera import Intrinsics
-from protocols.geometry.sphere_projection import outline_to_centre
+from protocols.geometry.camera import Intrinsics, outline_to_centre
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations, Track
 from protocols.session.rig import Rig, RigCamera

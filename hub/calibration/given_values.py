@@ -126,7 +126,6 @@ class ScaleBarMeasurement:
     """One scale bar measured from the trajectories. length: given [rig units]. measured: in the solution's units.
     std: relative, of the measurement."""
 
-    labels: tuple[str, str]
     length: float
     measured: float
     std: float
@@ -151,7 +150,7 @@ def measure_scale_bars(
                 "are these its two ends?"
             )
         std = 1.2533 * spread / np.sqrt(max(len(distances) * _SAMPLING_STEP / _CORRELATION_TIME, 1.0))
-        out.append(ScaleBarMeasurement((a, b), length, median, float(std)))
+        out.append(ScaleBarMeasurement(length, median, float(std)))
     return out
 
 

@@ -19,8 +19,7 @@ from hub.live.live_hub import SILENT_S, LiveHub
 from hub.live.messages import rig_message
 from hub.live.shard import ROLE as SHARDS
 from hub.live.shard import Shard
-from protocols.bus.base import Bus, Publisher, Received, agent_status
-from protocols.bus.commands import CommandSubscription
+from protocols.bus.base import Bus, CommandSubscription, Publisher, Received, agent_status
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.rig import Rig
 from protocols.topics import (

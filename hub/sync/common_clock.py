@@ -63,7 +63,6 @@ def solve_common_clock_pair(
         rate=1.0,
         offset=0.0,
         geometry=best.geometry,
-        cost=best.cost,
         residual_px=float(np.median(distance)) / 0.6745 * s.sigma_px,
         inliers=float(inlier.mean()),
         in_front=float(front.mean()) if len(front) else 0.0,

@@ -74,7 +74,7 @@ def refine_and_test(
         return solution
     found, covariance, rate_prior_std = _with_rate_prior(samples, found, noise, fixed_geometry)
     rate = 1.0 / found.inverse_rate
-    last = samples.evaluate(found.cost, rate, samples.centre - rate * found.intercept, found.geometry)
+    last = samples.evaluate(rate, samples.centre - rate * found.intercept, found.geometry)
     last = replace(
         last,
         log10_false_alarm=fit.log10_false_alarm,

@@ -21,8 +21,6 @@ class PairFit:
     """Offset of the same time map [s]."""
     geometry: TwoViewGeometry
     """Relative pose with intrinsics, fundamental matrix without."""
-    cost: float
-    """Mean robust squared Sampson distance over the noise."""
     residual_px: float
     """Robust std of the Sampson distance [px]."""
     inliers: float

@@ -49,12 +49,11 @@ class NullDistribution:
     """Scaled chi-square distribution of the misfit of unrelated stretches.
 
     Misfit: mean squared distance over the squared noise. log_median: natural log of the median of misfit + COST_FLOOR.
-    dof: degrees of freedom, from the spread. count: number of misfits that it was fitted to.
+    dof: degrees of freedom, from the spread.
     """
 
     log_median: float
     dof: float
-    count: int
 
     def log10_false_alarm(self, cost: float, inlier_ratio: float, cycles: float) -> float:
         """log10 of the false-alarm probability: that one wrong alignment has a misfit of at most ``cost``.
@@ -122,7 +121,7 @@ def fit_null_distribution(
 def _fit_chi_square(costs: Floats) -> NullDistribution:
     logs = np.log(costs + COST_FLOOR)
     middle = median(logs)
-    return NullDistribution(middle, _dof_from_spread(middle - quantile(logs, _LOW_QUANTILE)), len(costs))
+    return NullDistribution(middle, _dof_from_spread(middle - quantile(logs, _LOW_QUANTILE)))
 
 
 def _stretch_costs(

@@ -433,7 +433,7 @@ class _PairSearch:
                 return None
             best, rate = again, 1.0 / again.inverse_rate
             offset = samples.centre - rate * best.intercept
-        return samples.evaluate(best.cost, rate, offset, best.geometry)
+        return samples.evaluate(rate, offset, best.geometry)
 
     def _best_start(
         self,
@@ -579,4 +579,4 @@ def _peaks(offset: Floats, value: Floats, max_candidates: int) -> list[int]:
 def evaluate_alignment(a: SmoothTrack, b: SmoothTrack, offset: float, pose: RelativePose) -> PairFit:
     """Quality figures of an alignment ``t_a = t_b + offset`` [s] that another method estimated."""
     s = PairSettings()
-    return Samples([a], [b], offset, s, s.refinement_samples).evaluate(0.0, 1.0, offset, pose)
+    return Samples([a], [b], offset, s, s.refinement_samples).evaluate(1.0, offset, pose)

@@ -128,7 +128,7 @@ class Samples:
         residual = relative_pose.sampson(result.geometry.matrix, pairs.a, pairs.b, *sigma)
         return 2.0 * float(autocorrelation(residual).sum()) - 1.0
 
-    def evaluate(self, cost: float, rate: float, offset: float, geometry: TwoViewGeometry) -> PairFit:
+    def evaluate(self, rate: float, offset: float, geometry: TwoViewGeometry) -> PairFit:
         """The alignment ``t_a = rate * t_b + offset`` with quality figures, over the samples where both tracks move."""
         b, velocity_b = self.interpolate_b((self.time - offset) / rate)
         smooth, velocity_a = self._interpolate(self.a, self.time)
@@ -140,7 +140,7 @@ class Samples:
         a, smooth, b = (one.T.compress(moving, axis=1).T for one in (self.points, smooth, b))
         count = len(a)
         if count < 8:
-            return PairFit(rate, offset, geometry, cost, np.inf, 0.0, 0.0, 0.0, 0.0, self.centre, 0.0)
+            return PairFit(rate, offset, geometry, np.inf, 0.0, 0.0, 0.0, 0.0, self.centre, 0.0)
         sigma_a, sigma_b = self.settings.sigma_px / focal_a, self.settings.sigma_px / focal_b
         distance = np.abs(relative_pose.sampson(geometry.matrix, a, b, sigma_a, sigma_b))
         smoothed = relative_pose.sampson(geometry.matrix, smooth, b, sigma_a, sigma_b)
@@ -159,7 +159,6 @@ class Samples:
             rate=rate,
             offset=offset,
             geometry=geometry,
-            cost=cost,
             residual_px=median(distance) / 0.6745 * self.settings.sigma_px,
             inliers=inliers,
             in_front=float(front.mean()) if len(front) else 0.0,

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from hub.tracking.association.assignment import colour_score, matching_colour_std
-from hub.tracking.association.continuation import EntryExitRates, continuation_scores
+from hub.tracking.association.reidentification import EntryExitRates, continuation_scores
 from hub.tracking.association.scan import FrameEvidence, associate_jointly
 from hub.tracking.filter.floor import Floor
 from hub.tracking.filter.kalman import LOG_SIZE, POSITION, STATE_DIM, fused, with_information

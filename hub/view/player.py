@@ -79,7 +79,6 @@ class LogRecording:
         return sorted([*solved[:1], *recent, *solved[-1:], *last.values()], key=lambda timed: timed[0])
 
     def messages(self, start: float) -> Iterator[Timed]:
-        """All messages from ``start`` [s] on."""
         begin = self._first + round(start * NANOSECONDS)
         for logged in self._reader.messages([*TOPICS, *ON_IMAGES, PICTURE, FLIGHT_IMAGE], begin):
             yield (logged.log_time_ns - self._first) / NANOSECONDS, logged.message

@@ -1,8 +1,9 @@
-"""The bus interface that agents use. Two implementations: Zenoh and in-memory."""
+"""The bus interface that agents use. Two implementations: Zenoh and in-memory. Commands of an operator."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections import deque
+from collections.abc import Collection, Mapping, Set
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -12,8 +13,10 @@ from google.protobuf.message import Message
 
 from protocols.core.version import VERSION
 from protocols.messages import syncline_pb2 as pb
-from protocols.topics import Topic
+from protocols.topics import COMMAND, Topic
 from protocols.validation.rules import SCHEMA_VERSION
+
+_DUPLICATE_WINDOW = 1024  # commands: a click a second for a quarter of an hour
 
 
 class BusDead(Exception):
@@ -165,3 +168,34 @@ def agent_status(
         schema_version=SCHEMA_VERSION, version=VERSION, agent=agent, role=role, boot_id=boot_id, sequence=sequence,
         state=state, message=text, counters=counters, gauges=gauges,
     )  # fmt: skip
+
+
+class CommandSubscription:
+    """The commands addressed to one run of one agent.
+
+    agent, boot: its id and boot id; commands to an earlier run are ignored by a later one. actions: the actions that
+    it supports; others are ignored.
+    """
+
+    def __init__(self, bus: Bus, agent: str, boot: str, actions: Collection[str]) -> None:
+        self._subscription = bus.subscribe(COMMAND)
+        self._agent, self._boot, self._actions = agent, boot, frozenset(actions)
+        self._known: deque[tuple[str, str, int]] = deque(maxlen=_DUPLICATE_WINDOW)
+
+    def take(self) -> list[str]:
+        """The actions requested since the last call, in order."""
+        actions = []
+        for received in self._subscription.drain():
+            command = received.message
+            assert isinstance(command, pb.Command)
+            identity = (command.sender, command.boot_id, command.sequence)
+            if (command.agent, command.agent_boot) != (self._agent, self._boot) or identity in self._known:
+                continue
+            self._known.append(identity)
+            if command.action in self._actions:
+                actions.append(command.action)
+        return actions
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._subscription.close()

@@ -12,8 +12,11 @@ if TYPE_CHECKING:
     from typing import Any
 
 
-def lazy_names(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """``__getattr__`` and ``__dir__`` of a package. modules: by name, the dotted module that defines it."""
+def lazy_names(
+    package: str, names_of: Mapping[str, Sequence[str]]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """``__getattr__`` and ``__dir__`` of a package. names_of: by dotted module, the names that it defines."""
+    modules = {name: module for module, names in names_of.items() for name in names}
 
     def get(name: str) -> Any:
         if name not in modules:

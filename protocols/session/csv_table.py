@@ -1,18 +1,23 @@
-"""CSV files of numbers with named columns; every mistake is reported with file, line and remedy."""
+"""CSV files of numbers with named columns, mistakes with file, line and remedy; tables for notebooks."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from protocols.core.errors import InputError
 from protocols.core.files import read_text
 from protocols.geometry.types import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    import pandas
+
 
 _LARGEST_WHOLE = 2.0**53
 """Up to here a float represents every whole number."""
@@ -149,3 +154,12 @@ def _number(cell: str) -> float:
         return float(cell)
     except ValueError:
         return np.nan
+
+
+def dataframe(columns: Mapping[str, Any]) -> pandas.DataFrame:
+    """A pandas DataFrame of columns of equal length. Raises InputError where pandas is not installed."""
+    try:
+        import pandas
+    except ImportError:
+        raise InputError("pandas is not installed", remedy="pip install pandas") from None
+    return pandas.DataFrame(dict(columns))

@@ -55,7 +55,7 @@ class RigCamera:
     focal_std: relative std of the focal length; 0 = none is given, and it is exact.
     up: (3,) unit vector, away from the ground in the camera's own axes, as its accelerometer shows at rest.
     ball_outline: whether its rows are centroids of spheres' contours of diameter ``size``, detected without a known
-    lens and so not yet corrected to the projection of the centre (``protocols/geometry/sphere_projection.py``).
+    lens and so not yet corrected to the projection of the centre (``protocols/geometry/camera.py``).
     readout: seconds from the first row of an image to its last (rolling shutter); None = not given.
     table: the camera's table as it is in the file, including keys that this version does not know.
     """

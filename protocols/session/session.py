@@ -11,7 +11,7 @@ import numpy as np
 import tomli_w
 
 from protocols.core.errors import InputError
-from protocols.core.tables import dataframe
+from protocols.session.csv_table import dataframe
 from protocols.session.folder import column_warnings
 from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks
 from protocols.session.rig import Rig, misspelt_keys, parse_rig

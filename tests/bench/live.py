@@ -23,7 +23,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 
-from deploy.agents.signals import interrupt_on_signals  # noqa: E402
+from deploy.agents.processes import interrupt_on_signals  # noqa: E402
 from deploy.offline.exchange.session_log import Arrivals, session_to_log  # noqa: E402
 from hub.calibration.pipeline import calibrate  # noqa: E402
 from protocols.core.errors import Refused  # noqa: E402

@@ -80,8 +80,8 @@ def quick(
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     import cv2
 
+    from deploy.agents.processes import stop_on_signals
     from deploy.agents.quick import QuickCalibration, QuickSettings, show_report
-    from deploy.agents.signals import stop_on_signals
     from deploy.offline.outputs import report_refusal, report_result
     from hub.api import CalibrationResult, remove_outputs
     from protocols.core.files import check_folder

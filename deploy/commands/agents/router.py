@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from deploy.agents.signals import stop_on_signals
+from deploy.agents.processes import stop_on_signals
 from deploy.commands.common import PrintConfig
 from deploy.config.agents import RouterConfig
 from deploy.config.file import effective_toml, load

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deploy.agents.signals import stop_on_signals
+from deploy.agents.processes import stop_on_signals
 from deploy.commands.common import PrintConfig
 from deploy.config.agents import CameraConfig, HubConfig, RecorderConfig
 from deploy.config.file import effective_toml, load

@@ -80,7 +80,7 @@ def view(
     if recording is not None and connect:
         raise InputError("--connect goes with the bus, not with a recording", remedy="leave one of the two out")
     serve = _server(listen, port, token, look_only)
-    from deploy.agents.signals import stop_on_signals
+    from deploy.agents.processes import stop_on_signals
 
     if recording is not None:
         from hub.view.server import run_replay
@@ -95,7 +95,7 @@ def view(
 
 
 def _serve_live(settings: BusConfig, site: str, serve: Callable[[Any], ViewServer], browser: bool, json: bool) -> int:
-    from deploy.agents.signals import stop_on_signals
+    from deploy.agents.processes import stop_on_signals
     from hub.view.server import run_view
     from protocols.bus.base import BusDead, BusStopped
     from protocols.bus.transport.zenoh_bus import open_bus

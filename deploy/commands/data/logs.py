@@ -175,7 +175,7 @@ def replay(
         return _compare(log, compare, topics, tolerance or [], as_json=json)
     if not 0.0 <= start < 1e9:
         raise InputError(f"--start {start} is out of range", remedy="give seconds from the log's beginning")
-    from deploy.agents.signals import stop_on_signals
+    from deploy.agents.processes import stop_on_signals
     from deploy.logs.replay import replay as play
     from protocols.bus.base import BusStopped
     from protocols.bus.settings import BusConfig

@@ -94,7 +94,7 @@ def track(
         raise InputError(f"--start {start} is negative", remedy="give the index of a frame, 0 is the first")
     from deploy.evaluation.track_scores import read_truth, score
     from deploy.offline import track as tracking
-    from deploy.offline.track_log import LoggedFlightImages, open_recording
+    from deploy.offline.telemetry_files import LoggedFlightImages, open_recording
     from edge.devices.playback.video_writer import video_writer
     from edge.uav import tracker_factory
 
@@ -196,8 +196,13 @@ def _samples(
     """The telemetry's samples, warnings, and what corrects positions by them where they are surely on the video's
     clock. Raises InputError."""
     from deploy.offline import track as tracking
-    from deploy.offline.telemetry_files import Footage, align_to_video, check_attitudes, read_telemetry_log
-    from deploy.offline.track_log import LoggedFlightImages
+    from deploy.offline.telemetry_files import (
+        Footage,
+        LoggedFlightImages,
+        align_to_video,
+        check_attitudes,
+        read_telemetry_log,
+    )
     from edge.uav.georeference import Georeference
 
     recording, count, warnings, aligned = flight.recording, flight.frames, [], False

@@ -63,7 +63,7 @@ def fleet(
 
 
 def _up(name: str, simulated: bool, seconds: float | None, out: Path, json: bool) -> int:
-    from deploy.agents.signals import stop_on_signals
+    from deploy.agents.processes import stop_on_signals
     from deploy.site.fleet import Fleet
     from deploy.site.rig_folder import find_rig, read_rig_folder
     from protocols.bus.base import BusStopped

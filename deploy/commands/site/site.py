@@ -245,7 +245,7 @@ def monitoring(file: Path, /, *, out: Path) -> int:
     out
         Folder to write.
     """
-    from deploy.site.boards.monitoring import write_monitoring
+    from deploy.site.boards.site_file import write_monitoring
 
     for line in write_monitoring(_site(file), out):
         print(line)

@@ -26,8 +26,8 @@ from protocols.core.ranges import MAX_PIXEL
 from protocols.geometry.types import Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.csv_table import CsvTable, read_csv_header, read_csv_table
-from protocols.session.detections import KINDS, DetectionRows, read_detections, swapped_ends
 from protocols.session.folder import BOXES_FILE
+from protocols.session.observations import DetectionRows, read_detections, read_kinds, swapped_ends
 from protocols.validation.rules import SCHEMA_VERSION
 
 Kind = Literal["person", "vehicle"]
@@ -121,15 +121,11 @@ def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> Detectio
     _refuse_rounded_times(table)
     count = len(table)
     nothing = np.full((count, 4), np.nan)
-    kind = table.text("kind") if "kind" in table.columns else [""] * count
-    remedy = f"use one of {', '.join(KINDS[1:])}, or leave it empty"
-    table.refuse(
-        np.array([one not in KINDS for one in kind]), lambda row: f"kind {kind[row][:40]!r} is not known", remedy
-    )
     return DetectionRows(
+        table,
         camera=table.text("camera"),
         label=[""] * count,
-        kind=kind,
+        kind=read_kinds(table),
         frame=table.whole("frame"),
         time=table.numbers("time", _MAX_TIME_S),
         pixels=box[:, :2] + 0.5 * box[:, 2:],
@@ -139,7 +135,6 @@ def _box_rows(table: CsvTable, sizes: Mapping[str, tuple[int, int]]) -> Detectio
         head=nothing[:, :2],
         foot=nothing[:, :2],
         box=box,
-        line=table.line,
     )
 
 
@@ -201,7 +196,7 @@ def _check_pairs(rows: DetectionRows, file: Path) -> None:
     head, foot = rows.pixels[np.array(pairs, dtype=np.int64).reshape(-1, 2).T]
     for index in np.flatnonzero(swapped_ends(head, foot, [rows.camera[row] for row, _ in pairs]))[:1].tolist():
         what = f"{names[index]}: the head is not above the foot"
-        line = max(rows.line[row] for row in pairs[index])
+        line = max(rows.table.line[row] for row in pairs[index])
         raise InputError(what, file=file, line=line, remedy="swap the labels")
 
 

@@ -177,7 +177,11 @@ def oak_usb(root: Path = Path("/")) -> CheckResult:
         if _text(file) == "03e7":
             boards.append((file.parent.name, float(_text(file.parent / "speed") or 0.0)))
     if not boards:
-        return no_oak_board()
+        return misconfigured(
+            "usb",
+            "no OAK board (vendor 03e7) on USB",
+            "check cable and power; a PoE board needs device = its address in [oak]",
+        )
     slow = [name for name, speed in boards if speed < 5000.0]
     text = f"{len(boards)} OAK on USB: " + ", ".join(f"{name} {speed:g} Mbit/s" for name, speed in sorted(boards))
     if slow:
@@ -185,15 +189,6 @@ def oak_usb(root: Path = Path("/")) -> CheckResult:
             "usb", text, "use a USB 3 cable in a blue socket: 480 Mbit/s allows only small images or low frame rates"
         )
     return ok("usb", text)
-
-
-def no_oak_board() -> CheckResult:
-    """The failure that no OAK board is connected."""
-    return misconfigured(
-        "usb",
-        "no OAK board (vendor 03e7) on USB",
-        "check cable and power; a PoE board needs device = its address in [oak]",
-    )
 
 
 def _speed_above(device: Path) -> float | None:

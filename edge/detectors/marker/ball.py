@@ -22,8 +22,7 @@ from edge.detectors.marker.colour import ColourModel, colour_indices, learn_colo
 from edge.detectors.marker.static_background import StaticBackground
 from edge.detectors.marker.subpixel_outline import Outline, measure_outline
 from protocols.core.errors import InputError
-from protocols.geometry.camera import Intrinsics
-from protocols.geometry.sphere_projection import outline_to_centre
+from protocols.geometry.camera import Intrinsics, outline_to_centre
 from protocols.geometry.types import Bools, Floats
 
 _FLOOD_TOLERANCE = (26, 18, 18)  # tolerance of the flood fill in CIE L*a*b* (0..255): light and shade of a ball
@@ -59,7 +58,6 @@ class InteractiveMarkerDetector:
     def detect(
         self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
     ) -> list[Detection]:
-        """Detections in an image (H, W, 3) uint8 BGR."""
         return self._detector.detect(image)
 
 

@@ -65,7 +65,6 @@ class BrightDetector:
     def detect(
         self, image: npt.NDArray[np.uint8], time_s: float | None = None, predictions: Sequence[Prediction] = ()
     ) -> list[Detection]:
-        """Detections in an image (H, W, 3) uint8 BGR, best first."""
         level = _brightest(image)
         _, mask = cv2.threshold(level, float(self._model.threshold), 255.0, cv2.THRESH_BINARY)
         if not cv2.countNonZero(mask):

@@ -16,14 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.detectors.base import CUT_VEHICLE_STD, Detection, Prediction
-from edge.detectors.moving.association import match_predictions
 from edge.detectors.moving.camera_motion import ImageMotion
 from edge.detectors.moving.foreground import BackgroundSubtractor, SubtractorName
 from edge.detectors.moving.silhouette_detector import SilhouetteDetector
-from edge.detectors.moving.tracklets import ImageTracklet
+from edge.detectors.moving.tracklets import Box, ImageTracklet, match_predictions
 from protocols.geometry.types import Floats, Image
 
-Box = tuple[float, float, float, float]
 _MAX_PIXELS = 500_000  # larger images are downscaled to this
 _MIN_AREA_SHARE = 0.00025  # over the image area: smaller silhouettes are ignored
 _MOVING_SHIFT_PX = 0.35  # per frame: above it for a while, the camera moves

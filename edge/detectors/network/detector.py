@@ -59,11 +59,10 @@ class NetworkDetector:
     def detect(
         self, image: Image, time_s: float | None = None, predictions: Sequence[Prediction] = ()
     ) -> list[Detection]:
-        """See ``Detector``."""
         found = self._detections(image, self._infer([image])[0], time_s)
         if not predictions:
             return found
-        from edge.detectors.moving.association import match_predictions
+        from edge.detectors.moving.tracklets import match_predictions
 
         return match_predictions(found, predictions)
 

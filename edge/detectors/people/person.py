@@ -16,12 +16,11 @@ import cv2
 import numpy as np
 
 from edge.detectors.base import Detection, Prediction
-from edge.detectors.moving.association import match_predictions
 from edge.detectors.moving.camera_motion import CameraTravel
 from edge.detectors.moving.foreground import BackgroundSubtractor, ForegroundMasks, SubtractorName
 from edge.detectors.moving.shadows import is_ghost
 from edge.detectors.moving.silhouette_detector import SilhouetteDetector
-from edge.detectors.moving.tracklets import ImageTracklet
+from edge.detectors.moving.tracklets import ImageTracklet, match_predictions
 from edge.detectors.people.height_model import HeightModel
 from edge.detectors.people.segmentation import segment_people
 from edge.detectors.people.silhouettes import BULK, IsolatedPeople, PersonSilhouette

@@ -199,9 +199,7 @@ class ReconnectingCamera:
 
     def close(self) -> None:
         """Release the camera."""
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            connection.close()
+        self._release()
         self.ended = True
 
     def _numbered(self, frame: Frame) -> Frame:
@@ -209,10 +207,13 @@ class ReconnectingCamera:
         number = self._numbers.next(frame.frame, frame.device_time_ns, fps)
         return replace(frame, frame=number)
 
-    def _drop_connection(self) -> None:
+    def _release(self) -> None:
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
+
+    def _drop_connection(self) -> None:
+        self._release()
         self._numbers.connection_lost()
         self._awaiting_frame = False
         self._back_off.connection_lost(self._now_s())

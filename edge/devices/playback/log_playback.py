@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from edge.devices.base import DeviceInfo, Frame, check_size
-from edge.devices.playback.base import Playback
 from edge.devices.playback.playback_clock import PlaybackClock
+from edge.devices.playback.video_file import Playback
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
 from protocols.core.jpeg import ThumbnailScale, decode_jpeg

@@ -76,7 +76,6 @@ class FlightCamera:
 
     @property
     def ended(self) -> bool:
-        """Whether the flight is over."""
         return self._next >= self._last
 
     def open(self) -> None:
@@ -109,7 +108,6 @@ class FlightCamera:
         return self._world.render_from(index, rotation, centre)
 
     def close(self) -> None:
-        """May be called twice."""
         self._open = False
 
 
@@ -192,7 +190,6 @@ class SimulatedAircraft:
         self._history.append(self._pose())
 
     def sensor_readings(self, time: float) -> SensorReadings:
-        """Noisy sensor readings at ``time`` [s]."""
         pose = self.pose(time)
         earlier = self.pose(time - 0.02)
         rates = so3.log(earlier.ned_from_body.T @ pose.ned_from_body) / 0.02
@@ -206,12 +203,10 @@ class SimulatedAircraft:
         )
 
     def point_gimbal(self, time: float, pitch: float, yaw: float, earth: bool) -> None:
-        """Command the gimbal angles; see ``Airframe``."""
         with self._lock:
             self._commanded = np.array([np.clip(pitch, -0.5 * np.pi, 0.5), yaw if earth else yaw + self._yaw])
 
     def follow_target(self, time: float, position: Floats, velocity: Floats) -> None:
-        """Set the target to follow; see ``Airframe``."""
         with self._lock:
             self._target = (time, np.asarray(position, np.float64), np.asarray(velocity, np.float64))
 

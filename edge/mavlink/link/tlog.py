@@ -17,8 +17,7 @@ import numpy as np
 from edge.mavlink.dialect import AUTOPILOT, mavlink
 from edge.mavlink.link.connection import is_autopilot
 from edge.mavlink.link.framing import V1, V2, frame_length
-from edge.mavlink.roles.local_frame import LocalFrame
-from edge.mavlink.roles.telemetry import Attitude, GlobalPosition, LocalPosition, parse_telemetry
+from edge.mavlink.roles.telemetry import Attitude, GlobalPosition, LocalFrame, LocalPosition, parse_telemetry
 from edge.uav.base import Telemetry
 from edge.uav.navigation import interpolate_positions
 from protocols.core.errors import InputError

@@ -1,9 +1,9 @@
 """How often each message is sent, by what each ground station has asked for.
 
-A message has no addressee, so it is sent at the highest rate that any station present expects: what it asked for with
-SET_MESSAGE_INTERVAL, or else the default. One station that slows or stops a message therefore changes nothing for the
-others, and what a station asked for ends with it. Who selected the target counts as present, also where it sends no
-heartbeats, as scripts do.
+A message has no addressee, so it is sent at the highest rate that any station present expects: what it asked
+for with SET_MESSAGE_INTERVAL, or else the default. One station that slows or stops a message therefore changes
+nothing for the others, and what a station asked for ends with it. Who selected the target counts as present,
+also where it sends no heartbeats, as scripts do.
 """
 
 from __future__ import annotations

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 from edge.mavlink.dialect import AUTOPILOT, GIMBAL, mavlink
 from edge.mavlink.link.connection import Link, ReceivedMessage
-from edge.mavlink.roles.local_frame import LocalFrame
 from edge.mavlink.roles.telemetry import (
     Attitude,
     GimbalAttitude,
     GlobalPosition,
+    LocalFrame,
     LocalPosition,
     ned_from_gimbal,
     parse_telemetry,

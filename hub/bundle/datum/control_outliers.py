@@ -30,7 +30,7 @@ from hub.bundle.gls import solve_gls
 from hub.bundle.normal_equations import build_system
 from hub.bundle.problem import AdjustmentState, Problem
 from hub.bundle.smoothness_prior import SmoothnessPrior
-from hub.trajectory.banded import cho_solve_banded
+from hub.trajectory.splines import cho_solve_banded
 from protocols.geometry import so3
 from protocols.geometry.pose import Pose, Similarity
 from protocols.geometry.types import Floats

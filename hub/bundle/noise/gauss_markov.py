@@ -14,7 +14,7 @@ import numpy as np
 
 from hub.bundle.problem import AdjustmentState, CorrelatedNoise, Problem
 from hub.bundle.residuals import predict
-from hub.trajectory.banded import solve_tridiagonal
+from hub.trajectory.splines import solve_tridiagonal
 from protocols.geometry.types import Floats
 
 _MAX_ROWS = 6000

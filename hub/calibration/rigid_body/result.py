@@ -33,7 +33,6 @@ class BodySolution:
     """An adjusted problem. names: its cameras, in order. estimated: stds of lenses that an earlier
     adjustment of the same views estimated, as ``lens_stds``."""
 
-    rig: Rig
     labels: list[str]
     names: list[str]
     problem: BodyProblem

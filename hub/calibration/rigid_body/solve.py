@@ -155,7 +155,7 @@ def _solve(given: _Input, report: Progress, shared_clock: bool) -> BodySolution:
         )
         report("adjusting", 0.5)
         problem, state = adjust_bodies(problem, state)
-        solution = BodySolution(given.rig, given.labels, names, problem, state, pairs, refused, given.known)
+        solution = BodySolution(given.labels, names, problem, state, pairs, refused, given.known)
         worst, reason = _unacceptable(solution)
         if not reason:
             return solution

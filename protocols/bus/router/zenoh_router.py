@@ -62,7 +62,6 @@ class Router(Closing):
             return len(self._session.info.transports())
 
     def close(self) -> None:
-        """Stop relaying."""
         close_session(self._session)
 
 

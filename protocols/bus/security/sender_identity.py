@@ -144,23 +144,19 @@ class SenderCheckedSubscription:
         return accepted
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait for something to drain."""
         return self._inner.wait(timeout_s)
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """See the contract."""
         counts = Counter(self._inner.counters)
         counts.update(self._refused)
         counts["received"] -= sum(self._refused.values())
         return counts
 
     def flush(self) -> None:
-        """Queue what is held back."""
         self._inner.flush()
 
     def ignore(self, agents: Set[str]) -> None:
-        """Drop what these agents send."""
         self._inner.ignore(agents)
 
     def refusals(self) -> list[Refusal]:
@@ -168,7 +164,6 @@ class SenderCheckedSubscription:
         return []
 
     def close(self) -> None:
-        """Stop receiving."""
         self._inner.close()
 
 
@@ -179,17 +174,14 @@ class _StatusPublisher:
         self._bus, self._inner = bus, inner
 
     def put(self, message: Message) -> None:
-        """Publish the status."""
         if isinstance(message, pb.AgentStatus):
             message = self._bus.with_diagnostics(message)
         self._inner.put(message)
 
     def wait_matched(self, timeout_s: float) -> bool:
-        """Wait until somebody subscribes."""
         return self._inner.wait_matched(timeout_s)
 
     def close(self) -> None:
-        """Stop publishing."""
         self._inner.close()
 
 
@@ -221,34 +213,27 @@ class SenderCheckedBus(Closing):
 
     @property
     def site(self) -> str:
-        """The site whose keys this bus uses."""
         return self._bus.site
 
     def publisher(self, topic: Topic, agent: str, *, rate_hz: float | None = None, block: bool = False) -> Publisher:
-        """Declare a publisher."""
         publisher = self._bus.publisher(topic, agent, rate_hz=rate_hz, block=block)
         return _StatusPublisher(self, publisher) if topic is STATUS else publisher
 
     def subscribe(self, topic: Topic, agent: str = "*") -> Subscription:
-        """Subscribe to one agent or to all."""
         if self._watch is None:
             self._watch = self._bus.watch_agents()
         return SenderCheckedSubscription(self, self._bus.subscribe(topic, agent))
 
     def announce(self, role: str, agent: str, boot_id: str) -> AbstractContextManager[None]:
-        """Hold a liveliness token while the context is open."""
         return self._bus.announce(role, agent, boot_id)
 
     def watch_agents(self) -> AgentWatch:
-        """Watch all agents of the site appear and disappear."""
         return self._bus.watch_agents()
 
     def connected(self) -> bool:
-        """Whether this process can reach others."""
         return self._bus.connected()
 
     def close(self) -> None:
-        """Close the bus."""
         if self._watch is not None:
             self._watch.close()
         self._bus.close()

@@ -74,7 +74,6 @@ class MemoryPublisher:
                     subscription.inbox.push(self.key, payload)
 
     def wait_matched(self, timeout_s: float) -> bool:
-        """Wait for a subscription that matches."""
         with self._hub.changed:
             return self._hub.changed.wait_for(
                 lambda: any(subscription.matches(self.key) for subscription in self._hub.subscriptions),
@@ -82,7 +81,6 @@ class MemoryPublisher:
             )
 
     def close(self) -> None:
-        """Forget the cache."""
         with self._hub.lock:
             self._closed = True
             if self in self._hub.publishers:
@@ -118,7 +116,6 @@ class MemorySubscription(InboxSubscription):
         )
 
     def close(self) -> None:
-        """Stop receiving."""
         with self._hub.lock:
             if self in self._hub.subscriptions:
                 self._hub.subscriptions.remove(self)
@@ -137,12 +134,10 @@ class MemoryWatch(LivenessTracker):
                 self.mark(key, True)
 
     def mark(self, key: str, alive: bool) -> None:
-        """Process a liveliness token of this site."""
         if key.startswith(self._prefix):
             super().mark(key, alive)
 
     def close(self) -> None:
-        """Stop watching."""
         with self._hub.lock:
             if self in self._hub.watches:
                 self._hub.watches.remove(self)
@@ -160,7 +155,6 @@ class MemoryBus(Closing):
 
     @property
     def site(self) -> str:
-        """The site whose keys this bus uses."""
         return self._site
 
     def publisher(
@@ -173,14 +167,12 @@ class MemoryBus(Closing):
         return publisher
 
     def subscribe(self, topic: Topic, agent: str = "*") -> MemorySubscription:
-        """Subscribe to one agent or to all."""
         self._check_open()
         subscription = MemorySubscription(self._hub, topic, self._site, agent)
         self._declared.append(subscription)
         return subscription
 
     def connected(self) -> bool:
-        """Whether it is open."""
         return not self._closed
 
     @contextmanager
@@ -198,7 +190,6 @@ class MemoryBus(Closing):
                 self._hub.mark(key, False)
 
     def watch_agents(self) -> MemoryWatch:
-        """Watch all agents of the site appear and disappear."""
         self._check_open()
         watch = MemoryWatch(self._hub, self._site)
         self._declared.append(watch)

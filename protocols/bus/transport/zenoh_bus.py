@@ -91,7 +91,6 @@ class ZenohPublisher:
             )
 
     def put(self, message: Message) -> None:
-        """Publish one message."""
         if type(message) is not self._class:
             raise TypeError(f"{message.DESCRIPTOR.name} on a topic of {self._class.DESCRIPTOR.name}")
         payload = encode(message)
@@ -102,7 +101,6 @@ class ZenohPublisher:
                 raise
 
     def wait_matched(self, timeout_s: float) -> bool:
-        """Poll for a matching subscriber."""
         deadline = time.monotonic() + timeout_s
         with zenoh_call(f"match {self._key}"):
             if self._matcher is None:
@@ -404,7 +402,6 @@ class ZenohSubscription(InboxSubscription):
                         self._take_latest(question.source, key, number, sample.payload.to_bytes())
 
     def drain(self) -> list[Received]:
-        """Everything since the last call."""
         self._keys.declare()
         if self._heartbeats is not None:
             self._take_heartbeats(self._heartbeats)
@@ -445,7 +442,6 @@ class ZenohWatch(LivenessTracker):
         self.mark(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
     def close(self) -> None:
-        """Undeclare."""
         undeclare_all(self._subscriber)
 
 
@@ -470,20 +466,17 @@ class ZenohBus(Closing):
 
     @property
     def site(self) -> str:
-        """The site whose keys this bus uses."""
         return self._site
 
     def publisher(
         self, topic: Topic, agent: str, *, rate_hz: float | None = None, block: bool = False
     ) -> ZenohPublisher:
-        """Declare a publisher; see the contract."""
         key = topic.key_for(self._site, agent)
         publisher = ZenohPublisher(self._session, topic, key, cache_size(topic, rate_hz, self._outage_s), block)
         self._declared.append(publisher)
         return publisher
 
     def subscribe(self, topic: Topic, agent: str = "*") -> ZenohSubscription:
-        """Subscribe to one agent or to all."""
         key = subscription_key(topic, self._site, agent)
         subscription = ZenohSubscription(self._session, topic, key, self._clock_ns)
         self._declared.append(subscription)
@@ -491,7 +484,6 @@ class ZenohBus(Closing):
 
     @contextmanager
     def announce(self, role: str, agent: str, boot_id: str) -> Iterator[None]:
-        """Hold a liveliness token while the context is open."""
         key = liveliness_key(self._site, role, agent, boot_id)
         with zenoh_call(f"announce {key}"):
             token = self._session.liveliness().declare_token(key)
@@ -501,7 +493,6 @@ class ZenohBus(Closing):
             undeclare_all(token)
 
     def watch_agents(self) -> ZenohWatch:
-        """Watch all agents of the site appear and disappear."""
         watch = ZenohWatch(self._session, self._site)
         self._declared.append(watch)
         return watch
@@ -518,7 +509,6 @@ class ZenohBus(Closing):
         return others or not (self._needs_others or self._has_lost_others)
 
     def close(self) -> None:
-        """Undeclare everything and close the session."""
         while self._declared:
             self._declared.pop().close()
         close_session(self._session)

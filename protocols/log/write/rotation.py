@@ -87,7 +87,6 @@ class RotatingWriter(Closing):
         self._writer.sync()
 
     def close(self) -> None:
-        """As LogWriter.close."""
         self._writer.close()
 
     def _due(self, log_time_ns: int) -> bool:

@@ -9,7 +9,7 @@ from deploy.agents.recorder import record_on_command, with_unused_log_path
 from deploy.config.agents import RecorderConfig
 from hub.live.agent import run_hub
 from hub.live.live_hub import LiveHub
-from protocols.bus.commands import CommandSubscription
+from protocols.bus.base import CommandSubscription
 from protocols.bus.transport.memory import MemoryBus, MemoryHub
 from protocols.log.read.reader import LogReader
 from protocols.messages import syncline_pb2 as pb

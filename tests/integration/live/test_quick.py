@@ -23,7 +23,7 @@ pytest.importorskip("viser")
 
 @pytest.fixture(autouse=True)
 def _own_signals(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deploy.agents.signals.stop_on_signals", threading.Event)
+    monkeypatch.setattr("deploy.agents.processes.stop_on_signals", threading.Event)
 
 
 def test_two_videos_are_calibrated_without_any_configuration(

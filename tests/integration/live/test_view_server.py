@@ -199,7 +199,7 @@ def test_bad_arguments_are_reported_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("deploy.agents.signals.stop_on_signals", threading.Event)
+    monkeypatch.setattr("deploy.agents.processes.stop_on_signals", threading.Event)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     write_calibration(tmp_path / "known.toml")  # was taken for an agent's file, and the live bus shown

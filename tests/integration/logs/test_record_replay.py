@@ -335,7 +335,7 @@ import sys
 from pathlib import Path
 from deploy.config.agents import RecorderConfig
 from deploy.agents.recorder import run_recorder
-from deploy.agents.signals import stop_on_signals
+from deploy.agents.processes import stop_on_signals
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
 stop = stop_on_signals()

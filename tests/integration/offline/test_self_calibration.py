@@ -109,7 +109,7 @@ def exact_pairs(seed: int, count: int) -> tuple[dict[str, RigCamera], dict[str, 
             s = [focals[f"c{k}"] / 800.0 for k in (j, i)]
             matrix = relative_pose_between(poses[j], poses[i]).matrix
             nominal = np.diag([1 / s[1], 1 / s[1], 1.0]) @ matrix @ np.diag([1 / s[0], 1 / s[0], 1.0])
-            fit = PairFit(1.0, 0.0, FundamentalMatrix.of(nominal), *[1.0] * 9)
+            fit = PairFit(1.0, 0.0, FundamentalMatrix.of(nominal), *[1.0] * 8)
             pairs.append(PairSolution(f"c{j}", f"c{i}", "ok", fit))
     return {name: RigCamera(name, (1280, 960)) for name in focals}, focals, pairs
 

@@ -13,7 +13,7 @@ from deploy.offline.video_folder import session_from_videos
 from edge.agents.camera import detection_message
 from edge.detectors.plugins import load_detector
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.detections import read_detections
+from protocols.session.observations import read_detections
 from protocols.validation.rules import SCHEMA_VERSION, check
 from tests.support.command_line import refusal
 from tests.support.networks import constant_model, write_network

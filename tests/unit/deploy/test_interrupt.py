@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from deploy.agents.signals import Interruption, interrupt_on_signals
+from deploy.agents.processes import Interruption, interrupt_on_signals
 
 
 class Dying:

@@ -11,8 +11,7 @@ import pytest
 
 from hub.bundle.preprocessing import prepare
 from protocols.core.errors import InputError
-from protocols.geometry.camera import Intrinsics
-from protocols.geometry.sphere_projection import outline_to_centre
+from protocols.geometry.camera import Intrinsics, outline_to_centre
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations
 from protocols.session.rig import read_rig

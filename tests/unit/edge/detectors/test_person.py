@@ -13,12 +13,12 @@ import pytest
 from deploy.cli import run
 from edge import scenes
 from edge.detectors.base import Detection, Prediction
-from edge.detectors.moving.association import match_predictions
 from edge.detectors.moving.foreground import (
     BackgroundSubtractor,
     background_mode,
 )
 from edge.detectors.moving.shadows import ShadowDetector, is_ghost, remove_ghosts, uncovered_background
+from edge.detectors.moving.tracklets import match_predictions
 from edge.detectors.moving.vehicle import VehicleDetector
 from edge.detectors.people.height_model import HeightModel
 from edge.detectors.people.person import PersonDetector, clean_silhouettes, silhouette_features

@@ -21,7 +21,6 @@ GOOD = PairFit(
     rate=1.0,
     offset=2.0,
     geometry=RelativePose(np.eye(3), np.array([1.0, 0.0, 0.0])),
-    cost=0.3,
     residual_px=0.5,
     inliers=0.99,
     in_front=1.0,

@@ -73,7 +73,7 @@ def test_it_is_the_distribution_of_a_scaled_chi_square() -> None:
     rng = np.random.default_rng(0)
     for freedom in (1.0, 3.0, 6.0):
         draws = rng.chisquare(freedom, 400_000)
-        found = NullDistribution(math.log(100.0), freedom, 100)
+        found = NullDistribution(math.log(100.0), freedom)
         for cost in (1.0, 10.0, 60.0, 200.0):
             value = (cost + COST_FLOOR) / 100.0 * float(np.median(draws))
             share = (draws < value).mean()
@@ -81,7 +81,7 @@ def test_it_is_the_distribution_of_a_scaled_chi_square() -> None:
 
 
 def test_less_misfit_and_more_inliers_lower_the_probability() -> None:
-    found = NullDistribution(math.log(50.0), 5.0, 100)
+    found = NullDistribution(math.log(50.0), 5.0)
     by_cost = [found.log10_false_alarm(cost, 1.0, 100.0) for cost in (0.01, 0.1, 1.0, 10.0, 50.0, 200.0)]
     assert by_cost == sorted(by_cost)
     by_share = [found.log10_false_alarm(1.0, share, 100.0) for share in (1.0, 0.9, 0.5, 0.1, 0.0)]
@@ -91,7 +91,7 @@ def test_less_misfit_and_more_inliers_lower_the_probability() -> None:
 
 def test_few_cycles_are_no_evidence() -> None:
     """Seven parameters fit any seven independent values."""
-    found = NullDistribution(math.log(50.0), 8.0, 100)
+    found = NullDistribution(math.log(50.0), 8.0)
     assert found.log10_false_alarm(0.1, 1.0, 1.6) == 0.0
     by_cycles = [found.log10_false_alarm(0.1, 1.0, cycles) for cycles in (20.0, 3.0, 2.2, 1.8)]
     assert by_cycles == sorted(by_cycles)
@@ -100,7 +100,7 @@ def test_few_cycles_are_no_evidence() -> None:
 def test_the_smallest_probabilities_are_continuous() -> None:
     """The series takes over where the incomplete gamma function underflows: no step, no infinity."""
     medians = np.linspace(5.0, 25.0, 81)
-    found = [NullDistribution(float(x), 100.0, 100).log10_false_alarm(1.0 - COST_FLOOR, 1.0, 1e9) for x in medians]
+    found = [NullDistribution(float(x), 100.0).log10_false_alarm(1.0 - COST_FLOOR, 1.0, 1e9) for x in medians]
     assert found[0] > -200 > found[-1]
     np.testing.assert_allclose(np.diff(found), -0.25 * 50.0 / math.log(10.0), rtol=1e-2)
 

@@ -23,7 +23,6 @@ SLOW = PairFit(
     rate=1.0002,
     offset=2.0,
     geometry=RelativePose(np.eye(3), np.array([1.0, 0.0, 0.0])),
-    cost=0.2,
     residual_px=0.3,
     inliers=1.0,
     in_front=1.0,

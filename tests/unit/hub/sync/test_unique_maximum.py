@@ -26,7 +26,6 @@ STRONG = PairFit(
     rate=1.0001,
     offset=2.0,
     geometry=RelativePose(np.eye(3), np.array([1.0, 0.0, 0.0])),
-    cost=0.4,
     residual_px=0.6,
     inliers=1.0,
     in_front=1.0,

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from deploy.evaluation.clear_mot import EvaluationFrame, MotScores, clear_mot
 from edge.scenes.common.base import look_at_pose
 from hub.tracking import offline
-from hub.tracking.association.continuation import EntryExitRates
 from hub.tracking.association.initiation import LengthScale
+from hub.tracking.association.reidentification import EntryExitRates
 from hub.tracking.association.scan import associate_jointly
 from hub.tracking.detections import TrackingCamera, frame_detections
 from hub.tracking.filter.detection_model import posterior_existence

@@ -236,10 +236,3 @@ def test_a_stretch_of_zero_length_is_allowed() -> None:
     basis = SplineBasis.spanning(np.array([0.0, 5.0]), np.array([2.0, 5.0]), 0.25)
     control = np.ones((basis.size, 1))
     np.testing.assert_allclose(basis.evaluate(control, np.array([1.0, 5.0])), 1.0)
-
-
-def test_a_change_of_part_ends_a_stretch() -> None:
-    time = np.array([0.0, 0.1, 0.2, 0.3, 2.0])
-    begins, ends = split_at_gaps(time, 0.5, np.array([0, 0, 1, 1, 1]))
-    np.testing.assert_array_equal(begins, [0.0, 0.2, 2.0])
-    np.testing.assert_array_equal(ends, [0.1, 0.3, 2.0])

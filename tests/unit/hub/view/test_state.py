@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hub.view.access_control import AccessControl, is_local
 from hub.view.image_planes import pixel_of
 from hub.view.page import calibration_file, draw_detections
 from hub.view.panels import ago, camera_details, camera_table, overview
 from hub.view.player import CalibrationRecording, LogRecording, Player
 from hub.view.scene_renderer import fit_viewpoint
-from hub.view.server import action_result, commands_for
+from hub.view.server import AccessControl, action_result, commands_for, is_local
 from hub.view.state import SILENT_S, ViewState
 from protocols.core.errors import InputError
 from protocols.log.write.writer import LogWriter

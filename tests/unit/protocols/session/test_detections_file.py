@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from protocols.core.errors import InputError
-from protocols.session.detections import DetectionRows, read_detections
+from protocols.session.observations import DetectionRows, read_detections
 
 HEADER = "camera,frame,time,u,v,score,kind,cov_uu,cov_uv,cov_vv,head_u,head_v,foot_u,foot_v,box_x,box_y,box_w,box_h"
 PERSON = "a,0,0.5,100,80,0.9,person,4,1,9,100,40,101,140,80,40,40,100"

@@ -15,7 +15,7 @@ from edge.detectors.plugins import load_detector
 from edge.scenes.people.renderer import PeopleRenderer
 from edge.scenes.people.scene import PeopleScene
 from protocols.geometry.types import Bools, Floats
-from protocols.session.detections import read_detections
+from protocols.session.observations import read_detections
 from tests.support.people_boxes import overlap, score_boxes, truth
 from tests.support.videos import Image, write_video
 
