@@ -116,7 +116,7 @@ def assemble_calibration(
     # The outline of a person is wrong for a second at a time, and in ways that depend on the place, as a lens is.
     outlines = rig.metadata.get("target") == "person"
     if outlines:
-        bodies = [label.rpartition("-")[0] or label for label in reconstruction.labels]
+        bodies = [label.removesuffix("-head").removesuffix("-foot") for label in reconstruction.labels]
         covariance = cluster_robust(noisy, scaled, covariance, bodies)
     lens_stds, readout_stds = np.sqrt(np.maximum(covariance.variances[:, [Column.FOCAL, Column.READOUT]], 0.0)).T
     time_origins = [solution.prepared.time_origins[name] for name in names]

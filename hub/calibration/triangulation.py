@@ -29,9 +29,10 @@ from protocols.session.rig import METRES_PER_UNIT, Rig
 
 _SOUND_M_S = 340.0  # at 1000 times its size, what walks, drives or flies is beyond it
 _WAS_IT = "was it moved, or its clock set?"
-_FEW, _ODD_GAIN = 8, 1.3
-"""Cameras, of which each is left out in turn: of more the path follows the many. And times the residuals of the others,
-which of noisier detections are alike whichever is left out."""
+_FEW, _ODD_GAIN, _ROWS_LEFT_OUT = 8, 1.3, 2000
+"""Cameras, of which each is left out in turn: of more the path follows the many. Times by which the residuals of the
+others become less, which of noisier detections are alike whichever is left out. And rows of a camera and label that
+this is judged by, at about 0.2 ms each: more change no ratio of residuals."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,7 +99,7 @@ def _triangulate(
             refusal.permanent = True
             raise refusal
         # Of three and more, the camera that fits worst is removed, and the trajectories are estimated without it.
-        odd = _odd_one(prepared, known, reconstruction.names) or {failures[0][0]: failures[0][1].reason}
+        odd = _odd_one(prepared, known, reconstruction) or {failures[0][0]: failures[0][1].reason}
         unused |= {name: f"{reason}: {_WAS_IT}" for name, reason in odd.items()}
         names = [name for name in names if name not in odd]
     report("covariances", 0.8)
@@ -111,7 +112,7 @@ def _triangulate(
         name: f"residuals of {sigma:.1f} px, {calibrated_rms:.1f} px when it was calibrated"
         for name, (sigma, calibrated_rms) in larger_residuals(reconstruction, known).items()
     }
-    odd = _odd_one(prepared, known, reconstruction.names) if larger else {}
+    odd = _odd_one(prepared, known, reconstruction) if larger else {}
     warnings += [f"{name}: {why}: {_WAS_IT}" for name, why in (odd or larger).items()]
     triangulated = {table.label for table in tables if len(table.time)}
     return Triangulation(
@@ -161,21 +162,28 @@ def _reconstruct(prepared: PreparedSession, known: Mapping[str, CameraCalibratio
     return Reconstruction(reconstruction.names, reconstruction.labels, problem, state)
 
 
-def _odd_one(prepared: PreparedSession, known: Mapping[str, CameraCalibration], names: list[str]) -> dict[str, str]:
+def _odd_one(
+    prepared: PreparedSession, known: Mapping[str, CameraCalibration], found: Reconstruction
+) -> dict[str, str]:
     """Of a few cameras, the one without which the others fit far better than with it, and this as the reason.
 
-    Its own misfit may be less than theirs: the path follows whichever has most rows. Empty where no one stands out.
+    found: of all of them. Its own misfit may be less than theirs: the path follows whichever has most rows. Residuals
+    are in units of a camera's least ones, as some are noisier than others. Empty where no one stands out.
     """
-    residuals = {}
-    for name in names if 2 < len(names) <= _FEW else ():
+    step = 1 + max(len(one.time) for rows in prepared.rows.values() for one in rows) // _ROWS_LEFT_OUT
+    thinned = replace(prepared, rows={name: [one.every(step) for one in rows] for name, rows in prepared.rows.items()})
+    without = {}
+    for name in found.names if 2 < len(found.names) <= _FEW else ():
         with suppress(Refused):
-            rest = _reconstruct(prepared, known, [other for other in names if other != name])
-            residuals[float(np.mean(rest.state.sigma))] = name
-    if len(residuals) < len(names):
+            without[name] = _sigmas(_reconstruct(thinned, known, [other for other in found.names if other != name]))
+    if len(without) < len(found.names):
         return {}
-    least, more, *_ = sorted(residuals)
-    reason = f"the others fit to {least:.1f} px without it, to {more:.1f} px with it"
-    return {residuals[least]: reason} if more > _ODD_GAIN * least else {}
+    least = {name: min(rest[name] for rest in without.values() if name in rest) for name in found.names}
+    excess = {name: float(np.mean([rest[one] / least[one] for one in rest])) for name, rest in without.items()}
+    odd, other, *_ = sorted(excess, key=excess.__getitem__)
+    less, more = (float(np.mean([one[name] for name in without[odd]])) for one in (without[odd], _sigmas(found)))
+    reason = f"the others fit to {less:.1f} px without it, to {more:.1f} px with it"
+    return {odd: reason} if excess[other] > _ODD_GAIN * excess[odd] else {}
 
 
 def _time_maps(

@@ -180,14 +180,14 @@ class ObservationStream:
     def build(self, of_marker: bool, *, refusing: bool = True, newest_s: float = math.inf) -> tuple[Rig, Observations]:
         """The rig and the observations of the marker, or of people. Raises Refused where there are none, if asked.
 
-        newest_s: only what arrived in the last so many seconds, of the marker.
+        newest_s: only what was seen in the last so many seconds.
         """
         if of_marker:
             rig, observations = self.marker.build(newest_s)
             return rig, self._with_rate_changes_corrected(observations)
         cameras = {name: rig_camera_from_info(self._infos[name]) for name in sorted(self._infos)}
         rig = Rig(cameras, metadata={"target": PERSON})
-        observations = self.people.observations()
+        observations = self.people.observations().newest(newest_s)
         if refusing and not len(observations):
             raise Refused(AMBIGUOUS_COLOURS)
         return rig, observations

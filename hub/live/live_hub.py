@@ -629,6 +629,7 @@ class LiveHub:
     def _take_check(self, answer: SolverAnswer, now: float) -> None:
         """What the present rows say of the given calibration; that they say too little is no news."""
         self._next_check = max(self._next_check, now + answer.cpu_s / _CHECK_LOAD)
+        self.solver_failure = answer.reason if answer.failed else ""
         found = answer.calibration
         if found is None:
             self._known_faults = [answer.reason] if answer.permanent else self._known_faults
@@ -826,8 +827,14 @@ class LiveHub:
         And the frames of several unlabelled people, as soon as two cameras have filmed them for long enough.
         """
         of_marker = self._has_marker() or not self.settings.solve
+        try:
+            rig, observations = self.stream.build(of_marker, refusing=False, newest_s=newest_s)
+        except Refused:
+            if not (of_marker and self.stream.people.cameras):
+                raise
+            of_marker = False  # nobody has waved a marker since, but people have walked
+            rig, observations = self.stream.build(of_marker, refusing=False, newest_s=newest_s)
         held = {} if of_marker else self.stream.several_people(self._now)
-        rig, observations = self.stream.build(of_marker, refusing=False, newest_s=newest_s)
         spans = [(one[-1].device_time_ns - one[0].device_time_ns) / NANOSECONDS for one in held.values()]
         least = min(_COLOURS_FILM_S if len(observations) else _MIN_FILM_S, 0.8 * self.stream.people_window_s)
         people = tuple(itertools.chain(*held.values())) if sum(span >= least for span in spans) >= 2 else ()

@@ -67,6 +67,12 @@ class Observations:
     tracks: dict[tuple[str, str], Track]
     warnings: tuple[str, ...] = ()
 
+    def newest(self, seconds: float) -> Observations:
+        """The rows of the last so many seconds of each camera."""
+        last = {camera: max(track.time[-1] for track in self.of_camera(camera)) for camera in self.cameras}
+        tracks = {key: track.select(track.time > last[key[0]] - seconds) for key, track in self.tracks.items()}
+        return replace(self, tracks={key: track for key, track in tracks.items() if len(track)})
+
     def of_camera(self, camera: str) -> list[Track]:
         """The camera's tracks, one a label."""
         return [track for (name, _), track in self.tracks.items() if name == camera]

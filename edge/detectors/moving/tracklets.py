@@ -170,8 +170,6 @@ def match_predictions(detections: Sequence[Detection], predictions: Sequence[Pre
     """The detections, with ``target`` set where one is assigned to a prediction; each prediction at most once."""
     if not detections or not predictions:
         return list(detections)
-    from scipy.optimize import linear_sum_assignment
-
     cost = np.array([[_gate_distance(one, prediction) for prediction in predictions] for one in detections])
     result = list(detections)
     for row, column in zip(*linear_sum_assignment(np.minimum(cost, 10.0 * _GATE)), strict=True):

@@ -16,7 +16,7 @@ import numpy as np
 from hub.bundle.block_matrix import DenseCovariance
 from hub.bundle.covariance import Covariance
 from hub.bundle.noise.noise_scale import MAX_LAG_S, profiled_jacobian
-from hub.bundle.problem import CAMERA_PARAMETERS, AdjustmentState, Problem, UsedRows
+from hub.bundle.problem import CAMERA_PARAMETERS, LARGE_NETWORK, AdjustmentState, Problem, UsedRows
 from hub.bundle.residuals import StackedTrajectories, evaluate_labels, jacobians
 from protocols.geometry.types import Floats
 
@@ -26,20 +26,20 @@ def cluster_robust(problem: Problem, state: AdjustmentState, found: Covariance, 
 
     bodies: by label, whose point it is; errors of one body's points are together. A block is one body's rows within
     `MAX_LAG_S`. What is known beside the rows, as of priors and control points, counts as in ``found``; with no more
-    blocks than parameters nothing changes.
+    blocks than parameters, or in a large network, of which no dense covariance is made, nothing changes.
     """
     number = {
         (rows.camera, rows.label): np.floor(state.cameras[rows.camera].reference_time(rows.time[rows.use]) / MAX_LAG_S)
         for rows in problem.rows
     }
     count = len({(bodies[label], block) for (_, label), blocks in number.items() for block in blocks.tolist()})
-    if count <= len(found.columns):
+    if count <= len(found.columns) or len(state.cameras) > LARGE_NETWORK:
         return found
     values, axes = np.linalg.eigh(found.free.submatrix(np.arange(len(found.columns))))
     root = axes * np.sqrt(np.maximum(values, 0.0))
     spread, paths = np.eye(len(root)), StackedTrajectories.of(state.by_label)
     for body in dict.fromkeys(bodies):
-        blocks: dict[float, list[tuple[Floats, Floats]]] = {}
+        blocks: dict[float, Floats] = {}
         for rows in (one for one in problem.rows if bodies[one.label] == body and one.use.any()):
             seen = evaluate_labels(UsedRows.of([rows]), state.cameras[rows.camera], paths)
             weight = np.where(seen.valid, np.sqrt(seen.relative_information), 0.0) / float(state.sigma[rows.camera])
@@ -49,9 +49,12 @@ def cluster_robust(problem: Problem, state: AdjustmentState, found: Covariance, 
             left = (weight * seen.whitened(seen.residual)).T
             for block in np.unique(number[rows.camera, rows.label]).tolist():
                 here = number[rows.camera, rows.label] == block
-                blocks.setdefault(block, []).append((moves[here].reshape(-1, len(root)), left[here].ravel()))
+                parts = np.column_stack([moves[here].reshape(-1, len(root)), left[here].ravel()])
+                parts = np.concatenate([blocks[block], parts]) if block in blocks else parts
+                # Orthogonal to these are no moves: an hour of a body needs no more memory than its blocks.
+                blocks[block] = np.linalg.qr(parts).R if len(parts) > 2 * parts.shape[1] else parts
         for parts in blocks.values():
-            move, residual = (np.concatenate(one) for one in zip(*parts, strict=True))
+            move, residual = parts[:, :-1], parts[:, -1]
             spread -= move.T @ move
             along, size, across = np.linalg.svd(move, full_matrices=False)
             # How far the estimate moves without the block, in stds; none has more of the information than all of it.
