@@ -59,9 +59,10 @@ class CsvTable:
 
     def finite(self, name: str) -> Floats:
         """A column (n,) of finite numbers. Raises InputError."""
-        values = self.numbers_or_gaps(name)
-        remedy = "remove the row: a point not seen has none"
-        self.refuse(~np.isfinite(values), lambda row: f"{name} is {values[row]}", remedy)
+        cells = self.text(name)
+        values = _numbers(cells)
+        remedy = "give one, or remove the row of a point that was not seen"
+        self.refuse(~np.isfinite(values), lambda row: f"{name} {cells[row][:40]!r} is not a finite number", remedy)
         return values
 
     def whole(self, name: str) -> Ints:

@@ -167,6 +167,8 @@ def test_a_column_named_twice_is_reported(tmp_path: Path) -> None:
         ("a,2,10.2,1e999,2", "u"),
         ("a,x,10.2,1,2", "frame"),
         ("a,nan,10.2,1,2", "frame"),
+        ("a,img_2.png,10.2,1,2", "frame 'img_2.png' is not a finite number; give one, or remove the row"),
+        ("a,,10.2,1,2", "frame '' is not a finite number; give one"),
         ("a,2.5,10.2,1,2", "frame"),
         ("a,1e30,10.2,1,2", "frame"),
         ("c,2,10.2,1,2", "'c'"),
