@@ -59,8 +59,7 @@ class CsvTable:
 
     def finite(self, name: str) -> Floats:
         """A column (n,) of finite numbers. Raises InputError."""
-        cells = self.text(name)
-        values = _numbers(cells)
+        values = _numbers(cells := self.text(name))
         remedy = "give one, or remove the row of a point that was not seen"
         self.refuse(~np.isfinite(values), lambda row: f"{name} {cells[row][:40]!r} is not a finite number", remedy)
         return values
