@@ -34,6 +34,12 @@ class CsvTable:
     def __len__(self) -> int:
         return len(self.line)
 
+    def select(self, rows: Bools) -> CsvTable:
+        """The rows of a mask (n,)."""
+        kept = np.flatnonzero(rows)
+        columns = {name: [cells[row] for row in kept] for name, cells in self.columns.items()}
+        return CsvTable(self.file, columns, [self.line[row] for row in kept])
+
     def text(self, name: str) -> list[str]:
         """A column of n stripped cells."""
         return [cell.strip() for cell in self.columns[name]]

@@ -222,3 +222,15 @@ def test_frames_that_are_no_numbering_are_a_warning(tmp_path: Path) -> None:
     seen = read(tmp_path, HEAD + rows)
     assert len(seen) == 30
     assert "frame" in " ".join(seen.warnings)
+
+
+def test_people_of_one_label_beside_markers_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    head, tag = "camera,frame,time,u,v,label,kind\n", "a,0,0.0,7,8,tag7,marker\n"
+    seen = read(tmp_path, f"{head}a,0,0.0,1,2,person,person\n{tag}a,0,0.0,3,4,person,person\n")
+    assert seen.labels == ["tag7"]
+    assert seen.warnings == ("2 rows of people or vehicles left out: who is who is not known",)
+    assert read(tmp_path, f"{head}a,0,0.0,1,2,nose,person\n{tag}a,0,0.0,3,4,ear,person\n").labels == [
+        "ear",
+        "nose",
+        "tag7",
+    ]
