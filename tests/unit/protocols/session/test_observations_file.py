@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from protocols.core.errors import InputError
+from protocols.session.folder import write_observations
 from protocols.session.observations import DEFAULT_LABEL, Observations, read_observations
 from tests.support import command_line
 
@@ -234,3 +235,11 @@ def test_people_of_one_label_beside_markers_are_left_out_with_a_warning(tmp_path
         "nose",
         "tag7",
     ]
+
+
+def test_written_covariances_have_every_digit(tmp_path: Path) -> None:
+    head = HEAD.replace("v\n", "v,cov_uu,cov_uv,cov_vv\n")
+    seen = read(tmp_path, f"{head}a,0,0.0,1,2,0.11111111111111113,0,0.11111111111111113\n")
+    write_observations(tmp_path / "observations.csv", seen)
+    again = read_observations(tmp_path / "observations.csv", ["a", "b"])
+    assert [track.std for track in again.tracks.values()] == [track.std for track in seen.tracks.values()]
