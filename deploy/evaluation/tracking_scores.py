@@ -20,6 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from protocols.core.errors import InputError
+from protocols.core.ranges import MAX_LENGTH, MAX_TIME_S
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.session.csv_table import read_csv_header, read_csv_table
 
@@ -32,7 +33,6 @@ _MIN_COMMON, _MIN_CORRELATION, _MIN_EXTENT_M = 10, 0.9, 2.0
 _MAX_LATE_S = 10.0  # of times that are tried: clocks that were set by hand differ by seconds
 _MOST_INSTANTS = 200  # in which another frame is looked for, to bound its time
 _SMALL = 0.03  # change of scale, or turn [rad], that a path's noise explains
-_MAX_VALUE = 1e9  # of a time or a coordinate: float64 then still resolves 0.1 µm
 _INSTALL = "pip install --no-deps trackeval (its other requirements, a second OpenCV among them, are not needed)"
 
 
@@ -69,7 +69,7 @@ def read_ground_truth(file: Path, frame_times: Mapping[int, float] | None) -> Gr
     timed = "time" in read_csv_header(file, "truth")
     table = read_csv_table(file, "truth", ("time" if timed else "frame", "person", "x", "y"))
     if timed:
-        time = table.numbers("time", _MAX_VALUE)
+        time = table.numbers("time", MAX_TIME_S)
     else:
         frame = table.whole("frame").tolist()
         frame_times = {number: float(number) for number in frame} if frame_times is None else frame_times
@@ -81,7 +81,7 @@ def read_ground_truth(file: Path, frame_times: Mapping[int, float] | None) -> Gr
     people = table.text("person")
     names = {name: index for index, name in enumerate(dict.fromkeys(people))}
     person = np.array([names[name] for name in people], dtype=np.int64)
-    place = np.column_stack([table.numbers(name, _MAX_VALUE) for name in ("x", "y")])
+    place = np.column_stack([table.numbers(name, MAX_LENGTH) for name in ("x", "y")])
     pairs: dict[tuple[float, int], int] = {}
     for row, key in enumerate(zip(time.tolist(), person.tolist(), strict=True)):
         if pairs.setdefault(key, row) != row:

@@ -42,6 +42,8 @@ def replay_through_hub(
     hub = ScheduledHub() if recorded is not None else LiveHub(settings, known=known)
     count, first_ns, now_ns, site = 0, None, 0, ""
     with completed_file(out, new=True) as temporary, LogWriter(temporary, {"replay": {"through": "hub"}}) as writer:
+        if next(reader.messages([OBSERVATION]), None) is None:
+            raise InputError("no observation in this log", file=log, remedy="record cameras that see what moves")
 
         def publish(final: bool = False) -> int:
             published = hub.tick((now_ns - (first_ns or 0)) / NANOSECONDS, final=final)
@@ -59,7 +61,5 @@ def replay_through_hub(
             now_ns, site = max(now_ns, logged.log_time_ns), logged.site
             hub.handle(logged.message)
             count += publish()
-        if first_ns is None:
-            raise InputError("no observation in this log", file=log, remedy="record cameras that see what moves")
         count += publish(final=True)
     return count

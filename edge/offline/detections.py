@@ -24,6 +24,8 @@ from protocols.session.observations import COLUMNS
 if TYPE_CHECKING:
     import pandas
 
+    from protocols.messages import syncline_pb2 as pb
+
 HEADER = ",".join(("camera", "frame", "time", "u", "v", "size", "label", *COLUMNS))
 _PROGRESS_EVERY = 10  # frames
 
@@ -136,17 +138,17 @@ def detection_rows(camera: str, collected: Collected) -> list[str]:
     """The lines of observations.csv, without its header."""
     cell = csv_cell(camera)
     return [
-        ",".join((cell, str(number), f"{time:.17g}", _cells(one)))
+        ",".join((cell, str(number), f"{time:.17g}", cells_of(one)))
         for number, (time, seen) in collected.items()
         for one in seen
     ]
 
 
-def _cells(one: Detection) -> str:
+def cells_of(one: Detection | pb.Detection) -> str:
     """The cells from ``u`` on."""
     parts: list[float | None] = []
     for part, length in ((one.covariance, 3), (one.head, 2), (one.foot, 2), (one.box, 4)):
-        parts += [None] * length if part is None or not all(map(math.isfinite, part)) else list(part)
+        parts += [None] * length if not part or not all(map(math.isfinite, part)) else list(part)
     size = one.size if one.size > 0 else None
     place = _numbers((one.u, one.v, size))
     return ",".join((place, csv_cell(one.label), f"{one.score:.6g}", one.kind, _numbers(parts)))

@@ -34,6 +34,12 @@ class CsvTable:
     def __len__(self) -> int:
         return len(self.line)
 
+    def select(self, rows: Bools) -> CsvTable:
+        """The rows of a mask (n,)."""
+        kept = np.flatnonzero(rows)
+        columns = {name: [cells[row] for row in kept] for name, cells in self.columns.items()}
+        return CsvTable(self.file, columns, [self.line[row] for row in kept])
+
     def text(self, name: str) -> list[str]:
         """A column of n stripped cells."""
         return [cell.strip() for cell in self.columns[name]]
@@ -59,9 +65,9 @@ class CsvTable:
 
     def finite(self, name: str) -> Floats:
         """A column (n,) of finite numbers. Raises InputError."""
-        values = self.numbers_or_gaps(name)
-        remedy = "remove the row: a point not seen has none"
-        self.refuse(~np.isfinite(values), lambda row: f"{name} is {values[row]}", remedy)
+        values = _numbers(cells := self.text(name))
+        remedy = "give one, or remove the row of a point that was not seen"
+        self.refuse(~np.isfinite(values), lambda row: f"{name} {cells[row][:40]!r} is not a finite number", remedy)
         return values
 
     def whole(self, name: str) -> Ints:

@@ -188,6 +188,6 @@ def write_observations(file: Path, observations: Observations) -> None:
             if labelled:
                 cells.append(csv_cell(track.label))
             if stated:
-                cells += [f"{std**2:.9g}", "0", f"{std**2:.9g}"] if np.isfinite(std) else ["", "", ""]
+                cells += [f"{std**2:.17g}", "0", f"{std**2:.17g}"] if np.isfinite(std) else ["", "", ""]
             lines.append(",".join(cells))
     write_atomically(file, "\n".join(lines) + "\n")

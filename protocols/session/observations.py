@@ -129,8 +129,9 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
     cameras: the names that the rig knows. Raises InputError: file, line, what, remedy.
     """
     known = list(cameras)
-    rows = read_rows(file, known, ("cov_uu", "cov_vv"))
-    return gather_tracks(
+    table = _read_table(file, ("kind", "cov_uu", "cov_vv"))
+    rows = _parse_rows(table.select(kept := ~_are_unlabelled(table)), known)
+    found = gather_tracks(
         rows.camera,
         rows.label,
         rows.frame,
@@ -142,6 +143,19 @@ def read_observations(file: Path, cameras: Iterable[str]) -> Observations:
         file=file,
         lines=rows.table.line,
     )
+    if kept.all():
+        return found
+    what = f"{len(table) - len(rows.time)} rows of people or vehicles left out: who is who is not known"
+    return replace(found, warnings=(*found.warnings, what))
+
+
+def _are_unlabelled(table: CsvTable) -> Bools:
+    """Which rows (n,) are of people or vehicles, beside markers, where several in one frame have one label."""
+    kinds = table.text("kind") if "kind" in table.columns else [""] * len(table)
+    tracked = np.array([kind in ("person", "vehicle") for kind in kinds])
+    names = [table.text(name) if name in table.columns else kinds for name in ("camera", "label", "time")]
+    rows = [row for row, here in zip(zip(*names, strict=True), tracked, strict=True) if here]
+    return tracked & (not tracked.all() and len(set(rows)) < len(rows))
 
 
 def _stds(rows: ObservationRows) -> Floats | None:
@@ -158,7 +172,14 @@ def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) 
 
     optional: names of further columns, which every row must then have. Raises InputError: file, line, what, remedy.
     """
-    table = read_csv_table(file, "observations", REQUIRED, ("size", "label", *optional), "[,size][,label]")
+    return _parse_rows(_read_table(file, optional), cameras)
+
+
+def _read_table(file: Path, optional: Sequence[str]) -> CsvTable:
+    return read_csv_table(file, "observations", REQUIRED, ("size", "label", *optional), "[,size][,label]")
+
+
+def _parse_rows(table: CsvTable, cameras: Iterable[str]) -> ObservationRows:
     time, u, v = (table.finite(name) for name in ("time", "u", "v"))
     remedy = "give seconds; Unix time is about 1.8e9"
     table.refuse(np.abs(time) > MAX_TIME_S, lambda row: f"time {time[row]:g} is no time in seconds", remedy)
@@ -179,7 +200,7 @@ def read_rows(file: Path, cameras: Iterable[str], optional: Sequence[str] = ()) 
         if name not in known:
             what = f"camera {name!r} is not in the rig ({', '.join(known)})"
             remedy = f"add [{name}] to rig.toml or correct the name"
-            raise InputError(what, file=file, line=table.line[names.index(name)], remedy=remedy)
+            raise InputError(what, file=table.file, line=table.line[names.index(name)], remedy=remedy)
     return ObservationRows(
         table,
         names,

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from deploy.logs.diff import compare_logs
 from deploy.logs.replay_hub import replay_through_hub
 from edge.scenes import get_people_scene
 from hub.live.live_hub import LiveHub, LiveSettings
@@ -89,6 +90,8 @@ def again(live: Path) -> Path:
 def test_a_replay_repeats_the_live_answers_bit_for_bit(live: Path, again: Path) -> None:
     assert len(answers(live)) > 5
     assert answers(again) == answers(live)
+    comparison = compare_logs(live, again, {}, ["calibration"])
+    assert (comparison.equal, comparison.compared) == (True, len(answers(live)))
 
 
 def test_a_second_replay_gives_equal_bytes(live: Path, again: Path, tmp_path: Path) -> None:

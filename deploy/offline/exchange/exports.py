@@ -6,11 +6,12 @@ import json
 from pathlib import Path
 
 from deploy.offline.follow.results import RESULT, TRACKS
+from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError
-from protocols.core.files import file_in, read_text
+from protocols.core.files import file_in, read_text, write_atomically
 from protocols.formats import colmap, opensfm, toml_rigs, trajectories, xml_rigs, yaml_rigs
 from protocols.formats.cameras import ExportedFiles, convert_units
-from protocols.session.calibration import read_calibration
+from protocols.session.calibration import csv_cell, read_calibration
 from protocols.session.result import TRAJECTORY_FILE
 from protocols.session.rig import METRES_PER_UNIT
 
@@ -91,6 +92,7 @@ def trajectory_units(source: Path, given: str | None) -> tuple[str, tuple[str, .
 def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
     """Write a log as a session folder; returns numbers of cameras and observations, and warnings. Raises InputError."""
     from deploy.offline.exchange.session_log import rig_tables_of_log
+    from edge.offline.detections import observations_csv
     from protocols.log.read.session import session_from_log
     from protocols.session.folder import OBSERVATIONS_FILE, RIG_FILE, write_observations, write_rig
 
@@ -98,6 +100,26 @@ def export_log(log: Path, out: Path) -> tuple[int, int, tuple[str, ...]]:
         if (out / name).exists():
             raise InputError(f"a {name} is there already", file=out, remedy="choose another --out")
     rig, observations, warnings = session_from_log(log)
-    write_observations(out / OBSERVATIONS_FILE, observations)  # before the small one: a full disk leaves no session
-    write_rig(out / RIG_FILE, rig_tables_of_log(rig))
-    return len(rig.cameras), len(observations), warnings
+    rows = _rows_with_people(log)
+    if rows:
+        write_atomically(out / OBSERVATIONS_FILE, observations_csv(rows))
+    else:
+        write_observations(out / OBSERVATIONS_FILE, observations)
+    write_rig(out / RIG_FILE, rig_tables_of_log(rig))  # after the large one: a full disk leaves no session
+    return len(rig.cameras), len(rows) or len(observations), warnings
+
+
+def _rows_with_people(log: Path) -> list[str]:
+    """The lines of observations.csv of a log with people or vehicles, whom no label identifies; else none."""
+    from deploy.offline.follow.source import read_log
+    from edge.offline.detections import cells_of
+
+    messages = {(one.camera, one.sequence): one for one in read_log(log)[0]}
+    seen = [(frame, one) for frame in messages.values() for one in frame.detections]
+    tracked = [one for _, one in seen if one.kind in ("person", "vehicle")]
+    for one in tracked:
+        one.label = one.kind
+    return [
+        ",".join((csv_cell(frame.camera), f"{frame.frame},{frame.device_time_ns / NANOSECONDS:.17g}", cells_of(one)))
+        for frame, one in (seen if tracked else ())
+    ]

@@ -90,12 +90,12 @@ def read_follow_input(
     if file is None and (is_video_folder(session) or (detector is not None and session.is_dir())):
         log = out / LOG_OF_VIDEOS
         videos, warnings = detect_videos(session, known, kind, log, detector=detector, seed=seed, progress=progress)
-        messages, more = _read_log(log)
+        messages, more = read_log(log)
     elif detector is not None:
         raise InputError("--detector goes with a folder of videos", file=session, remedy="leave it out")
     elif file is None and is_log(session):
         log = session
-        messages, more = _read_log(session)
+        messages, more = read_log(session)
     elif file is None:
         remedy = f"give a folder with {OBSERVATIONS_FILE} or {BOXES_FILE}, a .mcap log, or a folder of videos"
         what = "nothing to follow in it" if session.exists() else "this session does not exist"
@@ -133,7 +133,7 @@ def _rows_file(session: Path) -> Path | None:
     return next((session / name for name in (OBSERVATIONS_FILE, BOXES_FILE) if (session / name).exists()), None)
 
 
-def _read_log(file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
+def read_log(file: Path) -> tuple[list[pb.Observation], tuple[str, ...]]:
     """The observations of a log, of each camera those of the boot with the most detections, and warnings."""
     reader = LogReader(file)
     messages: list[pb.Observation] = []
@@ -159,7 +159,7 @@ def check_log(file: Path, calibration: Path) -> tuple[str, ...]:
     """Warnings about the people in a log as `follow` gives them. Raises InputError where they contradict the units,
     pictures, poses or vertical of a calibration.toml."""
     known = read_given_calibration(calibration)
-    found, _ = followed_detections(without_clock_steps(_read_log(file)[0], file)[0], "person", known.sizes)
+    found, _ = followed_detections(without_clock_steps(read_log(file)[0], file)[0], "person", known.sizes)
     return check_units(found, known, "person", file) if any(message.detections for message in found) else ()
 
 

@@ -135,7 +135,7 @@ def test_invalid_options_are_one_line_and_status_2(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: list[str], said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    write(Path("a.mcap"), [(TRACK, "hub", track())])
+    write(Path("a.mcap"), [(CAMERA_INFO, "cam0", camera_info()), (TRACK, "hub", track())])
     assert said in refusal(capsys, ["replay", "a.mcap", *options])
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 

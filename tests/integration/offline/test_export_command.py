@@ -16,6 +16,11 @@ from deploy.cli import run
 from protocols.core.errors import InputError
 from protocols.core.files import file_in
 from protocols.geometry import so3
+from protocols.log.write.writer import LogWriter
+from protocols.messages import syncline_pb2 as pb
+from protocols.session.observations import read_detections, read_observations
+from protocols.topics import CAMERA_INFO, OBSERVATION
+from tests.support.samples import camera_info, observation
 
 
 @pytest.fixture
@@ -161,3 +166,23 @@ def test_a_full_disk_leaves_no_half_session_that_refuses_the_next_export(
         patch.setattr("protocols.session.folder.write_observations", full)
         assert run(["export", str(log), "--out", str(tmp_path / "out")]) == 2
     assert run(["export", str(log), "--out", str(tmp_path / "out")]) == 0
+
+
+def test_a_log_of_people_and_tags_keeps_everybody(tmp_path: Path) -> None:
+    """The table had one of the people of each frame, without head, foot, box and kind, under the label of a point."""
+    with LogWriter(tmp_path / "log.mcap") as log:
+        log.write(CAMERA_INFO, "cam0", "local", camera_info(), 0)
+        for sequence in range(3):
+            message = observation("cam0", sequence, points=1)
+            tag = pb.Detection(u=1.0, v=2.0, score=1.0, label="tag7", kind="marker")
+            other = pb.Detection(u=50.0, v=60.0, score=0.5, kind="person", head=[50.0, 40.0], foot=[50.0, 80.0])
+            message.detections.extend([other, tag])
+            log.write(OBSERVATION, "cam0", "local", message, sequence)
+    assert run(["export", str(tmp_path / "log.mcap"), "--out", str(tmp_path / "out")]) == 0
+    table = tmp_path / "out" / "observations.csv"
+    rows = read_detections(table, {"cam0": (640, 480)})
+    assert rows.label == ["person", "person", "tag7"] * 3
+    assert rows.kind == ["person", "person", "marker"] * 3
+    np.testing.assert_array_equal(rows.foot[:2], [[320.0, 290.25], [50.0, 80.0]])
+    np.testing.assert_array_equal(rows.box[0], [300.5, 210.5, 40.0, 80.0])
+    assert read_observations(table, ["cam0"]).labels == ["tag7"]

@@ -186,6 +186,11 @@ def test_frames_become_times(tmp_path: Path) -> None:
     assert truth.time.tolist() == [10.5]
 
 
+def test_times_since_1970_are_times(tmp_path: Path) -> None:
+    (tmp_path / "truth.csv").write_text("time,person,x,y\n1755500000.1234567,a,1,2\n", encoding="utf-8")
+    assert read_ground_truth(tmp_path / "truth.csv", None).time.tolist() == [1755500000.1234567]
+
+
 def test_without_trackeval_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "trackeval.metrics", None)
     truth, tracks, times = walk(0)

@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from protocols.core.errors import InputError
+from protocols.session.folder import write_observations
 from protocols.session.observations import DEFAULT_LABEL, Observations, read_observations
 from tests.support import command_line
 
@@ -167,6 +168,8 @@ def test_a_column_named_twice_is_reported(tmp_path: Path) -> None:
         ("a,2,10.2,1e999,2", "u"),
         ("a,x,10.2,1,2", "frame"),
         ("a,nan,10.2,1,2", "frame"),
+        ("a,img_2.png,10.2,1,2", "frame 'img_2.png' is not a finite number; give one, or remove the row"),
+        ("a,,10.2,1,2", "frame '' is not a finite number; give one"),
         ("a,2.5,10.2,1,2", "frame"),
         ("a,1e30,10.2,1,2", "frame"),
         ("c,2,10.2,1,2", "'c'"),
@@ -220,3 +223,23 @@ def test_frames_that_are_no_numbering_are_a_warning(tmp_path: Path) -> None:
     seen = read(tmp_path, HEAD + rows)
     assert len(seen) == 30
     assert "frame" in " ".join(seen.warnings)
+
+
+def test_people_of_one_label_beside_markers_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    head, tag = "camera,frame,time,u,v,label,kind\n", "a,0,0.0,7,8,tag7,marker\n"
+    seen = read(tmp_path, f"{head}a,0,0.0,1,2,person,person\n{tag}a,0,0.0,3,4,person,person\n")
+    assert seen.labels == ["tag7"]
+    assert seen.warnings == ("2 rows of people or vehicles left out: who is who is not known",)
+    assert read(tmp_path, f"{head}a,0,0.0,1,2,nose,person\n{tag}a,0,0.0,3,4,ear,person\n").labels == [
+        "ear",
+        "nose",
+        "tag7",
+    ]
+
+
+def test_written_covariances_have_every_digit(tmp_path: Path) -> None:
+    head = HEAD.replace("v\n", "v,cov_uu,cov_uv,cov_vv\n")
+    seen = read(tmp_path, f"{head}a,0,0.0,1,2,0.11111111111111113,0,0.11111111111111113\n")
+    write_observations(tmp_path / "observations.csv", seen)
+    again = read_observations(tmp_path / "observations.csv", ["a", "b"])
+    assert [track.std for track in again.tracks.values()] == [track.std for track in seen.tracks.values()]
