@@ -23,6 +23,7 @@ from edge.uav.correlation.redetection import TRIAL_SIZES, Prediction, Redetectio
 from edge.uav.correlation.scale import BoxFlow, ScaleFilter
 from edge.uav.correlation.search import search, tile
 from edge.uav.correlation.shape import Outline
+from edge.uav.correlation.template import Whitening
 from edge.uav.correlation.velocity import VelocityFilter
 from edge.uav.image_motion.first_motion import FirstMotion
 from edge.uav.image_motion.median_background import MedianBackground
@@ -100,15 +101,20 @@ class AppearanceTracker:
         """Learn from the target's box what it looks like, without anything before."""
         self._filter = CorrelationFilter(self.box.width, self.box.height)
         self._scale, self._flow, self._memory = ScaleFilter(), BoxFlow(), TemplateMemory()
+        self._whitened = TemplateMemory(Whitening(image, self.box))  # what it is recognised by after an absence
         self._filter.learn(image, self.box)
         self._scale.learn(image, self.box)
         self._flow.remember(image, self.box)
         self._memory.add(image, self.box)
+        self._whitened.add(image, self.box)
         self._colour = ColourModel(image, self.box)
         self._observe_background(image, self.box)
         self._shape = Outline(image, self.box)
         self._missed, self._unseen_s, self._searching, self._belief = 0, 0.0, False, Belief()
-        self._redetection = Redetection(self._size, self._memory, self._respond, self._colour)
+        self._redetection = self._new_redetection()
+
+    def _new_redetection(self) -> Redetection:
+        return Redetection(self._size, self._memory, self._whitened, self._respond, self._colour)
 
     def handle_frame(self, image: Image | None, time: float) -> Estimate:
         """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
@@ -265,6 +271,7 @@ class AppearanceTracker:
         self._belief.add(ratio, dt)
         if box.share_inside(self._size) > _LEARN_INSIDE:  # what scores the target, by expectation maximisation
             self._memory.confirm(score, self._belief.probability)
+            self._whitened.confirm(self._whitened.score(image, box), self._belief.probability)
             self._filter.confirm(answer, self._belief.probability)
         if self._belief.visible:
             self._accept(image, box, score, dt, stood)
@@ -334,6 +341,7 @@ class AppearanceTracker:
             self._scale.learn(image, box)
         if self._frame % _OBSERVE_EVERY == 0:
             self._memory.add(image, box)
+            self._whitened.add(image, box)
 
     def _anchored(self, image: Image, box: OrientedBox) -> OrientedBox:
         """The box, drawn towards the size, shape and angle at which it looks most like the first one.
@@ -362,22 +370,27 @@ class AppearanceTracker:
 
     def _observe_rivals(self, image: Image, box: OrientedBox) -> None:
         """Scores of what lies beside the target."""
-        beside = self._observe_places(image, box, box, 2.0 * box.sides)
-        if beside:
-            self._memory.observe_rival(max(beside))
+        for memory, scores in self._observe_places(image, box, box, 2.0 * box.sides):
+            memory.observe_rival(float(scores.max()))
 
-    def _observe_places(self, image: Image, box: OrientedBox, where: OrientedBox, reach: Floats) -> list[float]:
-        """Scores of the best places within ``reach`` of a box, off the target."""
+    def _observe_places(
+        self, image: Image, box: OrientedBox, where: OrientedBox, reach: Floats
+    ) -> list[tuple[TemplateMemory, Floats]]:
+        """Scores by either memory of the best places within ``reach`` of a box, off the target; none where none are."""
         found = search(image, self._memory, where, reach, 8)
         off = [f for f in found if np.abs(box.axes.T @ (f.box.centre - box.centre) / box.sides).max() > 0.7]
-        away = [f.score for f in off]
-        self._colour.observe(image, [f.box for f in off])
-        self._memory.observe_background(np.array(away), float(np.prod(1.0 + 2.0 * reach / box.sides)))
-        return away
+        if not off:
+            return []
+        boxes = [f.box for f in off]
+        self._colour.observe(image, boxes)
+        seen = [(self._memory, np.array([f.score for f in off])), (self._whitened, self._whitened.scores(image, boxes))]
+        for memory, scores in seen:
+            memory.observe_background(scores, float(np.prod(1.0 + 2.0 * reach / box.sides)))
+        return seen
 
     def _miss(self, dt: float) -> None:
         if self._missed == 0:
-            self._redetection = Redetection(self._size, self._memory, self._respond, self._colour)
+            self._redetection = self._new_redetection()
             # What it was lost to has moved it since the evidence was last clear.
             box, velocity = self._sure
             if velocity.std < _SURE_STD * self.length:

@@ -14,12 +14,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from edge.uav.correlation.features import Features, cell_features
-from edge.uav.correlation.oriented_box import OrientedBox, crop
+from edge.uav.correlation.features import Features
+from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.correlation.template import CELLS, CENTRED, Whitening, vectors, weighted
 from protocols.geometry.types import Floats, Image
 
-CELLS, CELL_PX = 6, 4  # along a side; along a cell: finer cells need a more exact place, coarser ones look alike
-SIDE = CELLS * CELL_PX
 _MAX_TEMPLATES = 8  # the first view and the last used: each costs a product at every place that is scored
 _NEW_BELOW = 0.9  # similarity to the most similar template below which a view becomes a template
 _TAIL_BINS = 20  # of the histogram of what places beside the target score, from 0 to 1
@@ -28,8 +27,6 @@ _PLACES = 300.0  # number of places that this start is worth
 _MIN_STD = 0.07  # of a score of the same thing, from one image to another
 _MAX_SCANNED = 4  # templates with which a region is searched
 CHANGED = 0.2  # share of the frames in which the target does not look as before
-_COLOUR_WEIGHT = np.float32(1.3)
-_CENTRED = np.float32(0.5)  # share of a channel's mean that is taken out
 
 
 @dataclass(slots=True)
@@ -53,7 +50,9 @@ class RunningNormal:
 class TemplateMemory:
     """Templates of one target, the first of which is never forgotten."""
 
-    def __init__(self) -> None:
+    def __init__(self, whitening: Whitening | None = None) -> None:
+        """whitening: for similarities between whitened vectors; ``scan``, which has none, is of the others."""
+        self._whitening = whitening
         self._templates: list[Features] = []
         self._used: list[int] = []
         self._count = 0
@@ -67,7 +66,7 @@ class TemplateMemory:
 
     def add(self, image: Image, box: OrientedBox) -> None:
         """Consider the box as a new template."""
-        new = vectors(image, [box])[0]
+        new = self._vectors(image, [box])[0]
         if self._templates:
             similarity = np.array([float(t @ new) for t in self._templates])
             if similarity.max() > _NEW_BELOW or not self.agrees(float(similarity[0])):
@@ -90,17 +89,21 @@ class TemplateMemory:
     def scores(self, image: Image, boxes: list[OrientedBox]) -> Floats:
         """Similarities (n,) of boxes to the most similar template; the best box's template counts as used."""
         self._count += 1
-        similarity = np.array(self._templates) @ vectors(image, boxes).T
+        similarity = np.array(self._templates) @ self._vectors(image, boxes).T
         self._used[int(similarity.max(axis=1).argmax())] = self._count
         return np.asarray(similarity.max(axis=0), np.float64)
 
     def first_scores(self, image: Image, boxes: list[OrientedBox]) -> Floats:
         """Similarities (n,) of boxes to the first template."""
-        return np.asarray(vectors(image, boxes) @ self._templates[0], np.float64)
+        return np.asarray(self._vectors(image, boxes) @ self._templates[0], np.float64)
+
+    def _vectors(self, image: Image, boxes: list[OrientedBox]) -> Features:
+        found = vectors(image, boxes)
+        return found if self._whitening is None else self._whitening.of(found)
 
     def scan(self, features: Features) -> Floats:
         """Scores (h - 5, w - 5) of all boxes of 6x6 cells of a feature map (12, h, w)."""
-        planes = _weighted(features)
+        planes = weighted(features)
         rows, columns = planes.shape[1:]
         shape = (scipy.fft.next_fast_len(rows, True), scipy.fft.next_fast_len(columns, True))
         valid = (slice(0, rows - CELLS + 1), slice(0, columns - CELLS + 1))
@@ -108,7 +111,7 @@ class TemplateMemory:
         mean = np.stack([cv2.boxFilter(plane, -1, (CELLS, CELLS), anchor=anchor) for plane in planes])[:, *valid]
         square = cv2.boxFilter(np.square(planes).sum(axis=0), -1, (CELLS, CELLS), anchor=anchor)[valid] * CELLS**2
         # A block without the share c of its mean m has the energy sum(b²) - (2 c - c²) n m².
-        share = _CENTRED * (2.0 - _CENTRED)
+        share = CENTRED * (2.0 - CENTRED)
         norm = np.sqrt(np.maximum(square - share * CELLS**2 * np.square(mean).sum(axis=0), 1e-6))
         spectrum = scipy.fft.rfft2(planes, s=shape)
         best = np.full(norm.shape, -1.0)
@@ -116,7 +119,7 @@ class TemplateMemory:
             product = (spectrum * self._spectrum(template, shape)).sum(axis=0)
             raw = scipy.fft.irfft2(product, s=shape)[valid]
             sums = template.reshape(len(features), -1).sum(axis=1)
-            raw = raw - _CENTRED * np.tensordot(sums, mean, 1)
+            raw = raw - CENTRED * np.tensordot(sums, mean, 1)
             np.maximum(best, raw / norm, out=best)
         return best
 
@@ -183,19 +186,3 @@ class TemplateMemory:
 
 def _density(deviation: float, std: float) -> float:
     return float(np.exp(-0.5 * (deviation / std) ** 2) / (std * np.sqrt(2.0 * np.pi)))
-
-
-def _weighted(features: Features) -> Features:
-    out = features.copy()
-    out[-3:] *= _COLOUR_WEIGHT
-    return out
-
-
-def vectors(image: Image, boxes: list[OrientedBox]) -> npt.NDArray[np.float32]:
-    """Unit vectors (n, 432) of boxes: their cells, each channel partly without its mean."""
-    side = SIDE + 2 * CELL_PX  # a cell around, which the features of the outer cells need
-    patches = np.concatenate([crop(image, box.sized(box.sides * side / SIDE), (side, side)) for box in boxes])
-    cells = _weighted(cell_features(patches, CELL_PX)).reshape(-1, len(boxes), CELLS + 2, CELLS + 2)
-    features = cells[:, :, 1:-1, 1:-1].transpose(1, 0, 2, 3).reshape(len(boxes), -1, CELLS * CELLS)
-    flat = (features - _CENTRED * features.mean(axis=2, keepdims=True)).reshape(len(boxes), -1)
-    return np.asarray(flat / (np.linalg.norm(flat, axis=1, keepdims=True) + 1e-6), np.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from edge.uav.correlation.colour import ColourModel
 from edge.uav.correlation.filter import Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
-from edge.uav.correlation.search import Found, search, tile
+from edge.uav.correlation.search import search, tile
 from edge.uav.image_motion.residual import UNKNOWN, Residual
 from edge.uav.image_motion.scene_motion import Motion
 from protocols.geometry.types import Floats, Image
@@ -58,10 +58,20 @@ class Prediction:
 
 
 class Redetection:
-    """One absence. size: of the images [px]; localise: the box and the answer of the target's filter about a box."""
+    """One absence. size: of the images [px]; localise: the box and the answer of the target's filter about a box.
 
-    def __init__(self, size: tuple[int, int], memory: TemplateMemory, localise: Localise, colour: ColourModel) -> None:
-        self._size, self._memory, self._localise = size, memory, localise
+    scanned: the memory that proposes places; memory: a whitened one, by whose similarities they are compared.
+    """
+
+    def __init__(
+        self,
+        size: tuple[int, int],
+        scanned: TemplateMemory,
+        memory: TemplateMemory,
+        localise: Localise,
+        colour: ColourModel,
+    ) -> None:
+        self._size, self._scanned, self._memory, self._localise = size, scanned, memory, localise
         # Probabilities that it is near the prediction, that it is in the image, and that it was not seen there.
         self._near, self._inside, self._unnoticed = 1.0, 0.0, 1.0
         self._left = 1.0  # share of where it was expected that no search has ruled out
@@ -116,29 +126,37 @@ class Redetection:
         """Take up the likeliest new place: in turn about the prediction, and in one tile after the other."""
         box, number = expected.box, expected.frames
         if number % 2:
-            found = search(image, self._memory, *tile(_view(box, number // 2), self._size, number // 2))
+            views = [tile(_view(box, number // 2), self._size, number // 2)]
         else:
             self._find_nothing(expected)
             reach = max(3.0 * expected.std, 2.0 * expected.wide)
-            views = _view(box, number), _view(box, number + 1)  # who drives through a bend may have turned by any angle
-            found = [f for view in views for f in search(image, self._memory, view, reach + 0.3 * view.sides)]
-        moving = [box.at(place) for place in self._moving.peaks(box.extent, _MOST_MOVING)]
-        found += [Found(place, self._memory.score(image, place)) for place in moving]
-        new = [f for f in found if not any(c.covers(f.box) for c in self._tested)]
+            # Who drives through a bend may have turned by any angle.
+            turned = [_view(box, number + k) for k in range(2)]
+            views = [(view, reach + 0.3 * view.sides) for view in turned]
+        places = [f.box for view in views for f in search(image, self._scanned, *view)]
+        places += [box.at(place) for place in self._moving.peaks(box.extent, _MOST_MOVING)]
+        for k, candidate in enumerate(self._tested):
+            seen = [place for place in places if candidate.covers(place)] if candidate.hits > _LONG_TEST // 2 else []
+            if seen:  # undecided, it may be seen at the wrong angle
+                best = seen[int(self._memory.scores(image, seen).argmax())]
+                other = replace(candidate, box=best, hits=0, evidence=0.0)
+                if self._test(image, other, expected, dt) and other.last > candidate.last + _RIVAL_MARGIN:
+                    self._tested[k] = other
+        new = [place for place in places if not any(c.covers(place) for c in self._tested)]
         if not new:
             return
-        priors = [self._log_prior(f.box.centre, expected) for f in new]
+        priors = [self._log_prior(place.centre, expected) for place in new]
         odds = [
-            self._memory.log_ratio(f.score, _CHANGE, self._moving.log_ratio(f.box.centre))
+            self._memory.log_ratio(score, _CHANGE, self._moving.log_ratio(place.centre))
             + prior
-            + self._colour.log_ratio(image, f.box)
-            for f, prior in zip(new, priors, strict=True)
+            + self._colour.log_ratio(image, place)
+            for place, score, prior in zip(new, self._memory.scores(image, new).tolist(), priors, strict=True)
         ]
         order = np.argsort(odds)[::-1]
         for k in order[:_MOST_TESTED]:
             # A rival that is about as likely is tested beside the likeliest one.
             if odds[k] > max(_WORTH_A_TEST, odds[order[0]] - _RIVAL_MARGIN):
-                candidate = Candidate(new[k].box, priors[k], expected.motion)
+                candidate = Candidate(new[k], priors[k], expected.motion)
                 if self._test(image, candidate, expected, dt):
                     self._tested.append(candidate)
 

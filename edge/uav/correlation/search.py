@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.uav.correlation.features import cell_features
-from edge.uav.correlation.memory import CELL_PX, CELLS, TemplateMemory
+from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox, crop
+from edge.uav.correlation.template import CELL_PX, CELLS
 from protocols.geometry.types import Floats, Image
 
 _MAX_CELLS = 3000  # of a region's feature map; a larger one is cut down about its centre

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from edge.uav.correlation.features import Features, cell_features
-from edge.uav.correlation.memory import CELL_PX, CELLS
 from edge.uav.correlation.oriented_box import OrientedBox, crop
+from edge.uav.correlation.template import CELL_PX, CELLS
 from protocols.geometry.types import Floats, Image
 
 _LOOKS_S, _LAST_S = 0.2, 1.2  # between two looks; the last one: later, the target has turned or is covered

@@ -87,7 +87,9 @@ def redetection() -> Redetection:
         return box, Response(0.0, 0.0, 0.0, 1.0)
 
     black = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    return Redetection(SIZE, TemplateMemory(), localise, ColourModel(black, OrientedBox(120.0, 120.0, 30.0, 20.0)))
+    return Redetection(
+        SIZE, TemplateMemory(), TemplateMemory(), localise, ColourModel(black, OrientedBox(120.0, 120.0, 30.0, 20.0))
+    )
 
 
 def test_a_target_beyond_the_border_is_not_ruled_out_by_what_the_image_shows() -> None:
@@ -232,7 +234,11 @@ def test_a_place_that_another_tracker_found_is_as_probable_as_it_is_near(scene: 
     """At even odds wherever it was, a pier 250 px off became a boat that was out of the picture."""
     image, box = painted(scene, np.array([120.0, 120.0])), OrientedBox(120.0, 120.0, *map(float, TARGET))
     search = Redetection(
-        SIZE, TemplateMemory(), lambda image, box: (box, Response(0.0, 0.0, 0.0, 1.0)), ColourModel(image, box)
+        SIZE,
+        TemplateMemory(),
+        TemplateMemory(),
+        lambda image, box: (box, Response(0.0, 0.0, 0.0, 1.0)),
+        ColourModel(image, box),
     )
     for x in (122.0, 300.0):
         search.propose(box.at(np.array([x, 120.0])), prediction(120.0))
@@ -246,7 +252,7 @@ def test_a_place_that_moves_under_test_looks_like_others_that_move(scene: Image)
     memory = TemplateMemory()
     memory.add(image, box)
     answer = Response(0.0, 0.0, 0.0, 1.0)
-    search = Redetection(SIZE, memory, lambda image, box: (box, answer), ColourModel(image, box))
+    search = Redetection(SIZE, memory, memory, lambda image, box: (box, answer), ColourModel(image, box))
     evidence = []
     for residual in (UNKNOWN, everywhere(20.0), everywhere(1.0)):
         search._moving = residual

@@ -16,6 +16,7 @@ from edge.uav.correlation.colour import ColourModel
 from edge.uav.correlation.filter import CorrelationFilter, Response
 from edge.uav.correlation.memory import TemplateMemory
 from edge.uav.correlation.oriented_box import OrientedBox
+from edge.uav.correlation.template import Whitening
 from edge.uav.correlation.velocity import VelocityFilter
 from tests.bench import uav_any_view, uav_rivals
 from tests.support.oblique.world import ObliqueWorld
@@ -214,7 +215,7 @@ def test_a_place_found_elsewhere_is_compared_with_the_predicted_one(
     monkeypatch.setattr(redetection.Redetection, "_test", lambda *_: True)
     box, answer = OrientedBox(400.0, 300.0, *map(float, TARGET)), Response(0.0, 0.0, 0.2, 1.0)
     colour = ColourModel(scene, box)
-    away = redetection.Redetection(SIZE, TemplateMemory(), lambda image, box: (box, answer), colour)
+    away = redetection.Redetection(SIZE, TemplateMemory(), TemplateMemory(), lambda image, box: (box, answer), colour)
     still = Kinematics(np.zeros(2), 1.0, float(TARGET[0]))
     promising = Candidate(box.at(np.array([100.0, 100.0])), 4.0, still, hits=1)
     away._tested = [promising]
@@ -263,3 +264,20 @@ def test_colour_tells_things_of_one_shape_apart_at_any_angle() -> None:
     assert model.log_ratio(image, other) < -3.0
     model.learn(image, own)
     assert model.log_ratio(image, own) > 1.0
+
+
+def test_whitened_places_have_less_in_common_and_the_target_stays_itself() -> None:
+    """What every place of a scene shows, here stripes, made places look alike that are not the target."""
+    rng = np.random.default_rng(4)
+    stripes = np.where(np.arange(SIZE[0]) % 24 < 12, 60.0, 180.0)[None, :, None]
+    image = np.clip(stripes + rng.normal(0.0, 20.0, (SIZE[1], SIZE[0], 3)), 0, 255).astype(np.uint8)
+    box = OrientedBox(300.0, 200.0, 48.0, 48.0)
+    cv2.circle(image, (300, 200), 18, (40, 200, 240), -1)
+    places = [box.at(np.array([float(x), float(y)])) for x in (60, 156, 540) for y in (60, 320, 420)]
+    again = np.clip(image.astype(float) + rng.normal(0.0, 10.0, image.shape), 0, 255).astype(np.uint8)
+    means = []
+    for memory in (TemplateMemory(), TemplateMemory(Whitening(image, box))):
+        memory.add(image, box)
+        assert memory.score(again, box) > 0.7
+        means.append(float(np.abs(memory.scores(again, places)).max()))
+    assert means[1] < 0.8 * means[0]
