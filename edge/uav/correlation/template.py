@@ -16,8 +16,8 @@ _SAMPLED = 300  # places of the first image: too few for a covariance without sh
 _STEPS = np.array([0.8191725134, 0.6710436067, 0.5497004779])  # of a sequence that fills a cube evenly (Roberts 2018)
 _BESIDE = 0.8  # distance from the target's centre, in sides of its box, from which a place shows something else
 _SHRINKAGE = 4.0
-"""Weight of the mean variance in all directions, beside the covariance's own: with 1 and 4, when scans were whitened, too,
-66 and 67 of 94 nadir windows and 30 and 31 of 42 oblique ones were held."""
+"""Weight of the mean variance in all directions, beside the covariance's own: with 1 and 4, when scans were whitened,
+too, 66 and 67 of 94 nadir windows and 30 and 31 of 42 oblique ones were held."""
 
 
 def weighted(features: Features) -> Features:
