@@ -168,7 +168,7 @@ def _odd_one(
     """Of a few cameras, the one without which the others fit far better than with it, and this as the reason.
 
     found: of all of them. Its own misfit may be less than theirs: the path follows whichever has most rows. Residuals
-    are in units of a camera's least ones, as some are noisier than others. Empty where no one stands out.
+    are in units of those when it was calibrated, as some are noisier than others. Empty where no one stands out.
     """
     step = 1 + max(len(one.time) for rows in prepared.rows.values() for one in rows) // _ROWS_LEFT_OUT
     thinned = replace(prepared, rows={name: [one.every(step) for one in rows] for name, rows in prepared.rows.items()})
@@ -178,8 +178,9 @@ def _odd_one(
             without[name] = _sigmas(_reconstruct(thinned, known, [other for other in found.names if other != name]))
     if len(without) < len(found.names):
         return {}
-    least = {name: min(rest[name] for rest in without.values() if name in rest) for name in found.names}
-    excess = {name: float(np.mean([rest[one] / least[one] for one in rest])) for name, rest in without.items()}
+    before = {name: known[name].rms_px for name in found.names}
+    units = before if min(before.values()) > 0.0 else dict.fromkeys(before, 1.0)
+    excess = {name: float(np.mean([rest[one] / units[one] for one in rest])) for name, rest in without.items()}
     odd, other, *_ = sorted(excess, key=excess.__getitem__)
     less, more = (float(np.mean([one[name] for name in without[odd]])) for one in (without[odd], _sigmas(found)))
     reason = f"the others fit to {less:.1f} px without it, to {more:.1f} px with it"
