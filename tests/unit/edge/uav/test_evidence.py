@@ -281,3 +281,20 @@ def test_whitened_places_have_less_in_common_and_the_target_stays_itself() -> No
         assert memory.score(again, box) > 0.7
         means.append(float(np.abs(memory.scores(again, places)).max()))
     assert means[1] < 0.8 * means[0]
+
+
+@pytest.mark.parametrize("sides", [(600.0, 440.0), (300.0, 300.0), (4.0, 4.0)])
+@pytest.mark.parametrize("noise", [0.0, 30.0])
+def test_a_target_of_any_size_before_any_scene_is_itself_when_whitened(
+    sides: tuple[float, float], noise: float
+) -> None:
+    """Beside one that fills the image there is no place, and a plain scene has no covariance."""
+    rng = np.random.default_rng(6)
+    image = np.clip(rng.normal(120.0, noise, (SIZE[1], SIZE[0], 3)), 0, 255).astype(np.uint8)
+    box = OrientedBox(0.5 * SIZE[0], 0.5 * SIZE[1], *sides)
+    cv2.ellipse(
+        image, (SIZE[0] // 2, SIZE[1] // 2), (int(sides[0] / 3), int(sides[1] / 4)), 0, 0, 360, (30, 60, 220), -1
+    )
+    memory = TemplateMemory(Whitening(image, box))
+    memory.add(image, box)
+    assert memory.score(image, box) == pytest.approx(1.0, abs=1e-3)
