@@ -54,14 +54,14 @@ class Whitening:
         centres = places[:, :2] * [image.shape[1], image.shape[0]]
         beside = (np.abs(centres - target.centre) > _BESIDE * target.extent).any(axis=1)
         step = max(int(target.sides.min() / SIDE), 1)  # finer pixels would be averaged at each place
-        image = cv2.resize(image, None, fx=1.0 / step, fy=1.0 / step, interpolation=cv2.INTER_AREA)
+        reduced = cv2.resize(image, None, fx=1.0 / step, fy=1.0 / step, interpolation=cv2.INTER_AREA)
         boxes = [
             target.at(centre).turned(2.0 * np.pi * turn).sized(target.sides / step)
             for centre, turn in zip(centres[beside] / step, places[beside, 2].tolist(), strict=True)
         ]
         self._mean, self._matrix = np.zeros(VECTOR, np.float32), np.eye(VECTOR, dtype=np.float32)
         if len(boxes) > 1:  # else the target fills the image, and vectors stay as they are
-            seen = vectors(image, boxes)
+            seen = vectors(np.asarray(reduced, np.uint8), boxes)
             self._mean, covariance = seen.mean(axis=0), np.cov(seen.T)
             covariance[np.diag_indices(VECTOR)] += _SHRINKAGE * np.trace(covariance) / VECTOR + _NO_TEXTURE
             self._matrix = np.linalg.inv(np.linalg.cholesky(covariance)).T.astype(np.float32)
