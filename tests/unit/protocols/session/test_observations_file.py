@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from protocols.core.errors import InputError
 from protocols.session.folder import write_observations
-from protocols.session.observations import DEFAULT_LABEL, Observations, read_observations
+from protocols.session.observations import DEFAULT_LABEL, Observations, gather_tracks, read_observations
 from tests.support import command_line
 
 HEAD = "camera,frame,time,u,v\n"
@@ -243,3 +243,11 @@ def test_written_covariances_have_every_digit(tmp_path: Path) -> None:
     write_observations(tmp_path / "observations.csv", seen)
     again = read_observations(tmp_path / "observations.csv", ["a", "b"])
     assert [track.std for track in again.tracks.values()] == [track.std for track in seen.tracks.values()]
+
+
+def test_the_newest_rows_are_those_of_each_cameras_last_seconds() -> None:
+    """A camera that saw nothing lately, or on another clock, keeps its own last rows."""
+    time, unknown = np.array([0.0, 5.0, 9.5, 1000.0, 1008.0]), np.full(5, np.nan)
+    rows = gather_tracks(list("aaabb"), list("pqppp"), np.arange(5), time, np.ones((5, 2)), unknown, order=("a", "b"))
+    kept = {key: track.time.tolist() for key, track in rows.newest(4.0).tracks.items()}
+    assert kept == {("a", "p"): [9.5], ("b", "p"): [1008.0]}
