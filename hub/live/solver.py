@@ -25,7 +25,7 @@ from hub.clocks.observation_stream import AMBIGUOUS_COLOURS
 from protocols.core.clocks import NANOSECONDS, CameraTime
 from protocols.core.errors import InputError, Refused
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.calibration import Calibration, CameraCalibration
+from protocols.session.calibration import Calibration, CameraCalibration, stated_up
 from protocols.session.observations import Observations
 from protocols.session.rig import Rig
 
@@ -62,7 +62,7 @@ class SolverJob:
 
     last: the answer to start from, with the cameras whose clock and pose hold; None = from scratch. search, full: of
     cameras that are not tied, and refine_lenses: see `update_calibration`. verify: only test whether the
-    rows agree with ``last``. people: frames of several unlabelled people; the observations are then of those associated
+    rows agree with ``last``; given: which was not solved here. people: frames of several unlabelled people; the observations are then of those associated
     by colour. by_place: ``last`` is by where people stand: colours are not tried.
     """
 
@@ -78,6 +78,7 @@ class SolverJob:
     refine_lenses: bool = False
     people: tuple[pb.Observation, ...] = ()
     by_place: bool = False
+    given: bool = False
 
     @property
     def compares_places(self) -> bool:
@@ -182,7 +183,7 @@ def _ways(job: SolverJob) -> list[Callable[[], Update]]:
     """
     ways: list[Callable[[], Update]] = [] if job.by_place and job.people else [partial(_by_labels, job)]
     if job.compares_places:
-        ways.append(partial(_by_place, job))
+        ways.append(partial(_by_feet if job.given else _by_place, job))
     return ways
 
 
@@ -223,6 +224,20 @@ def _by_place(job: SolverJob) -> Update:
     refused = {name: why if name in met else _NOBODY_MET for name, why in found.refused.items()} | followed.refused
     found = replace(found, refused={name: refused[name] for name in found.refused})
     return replace(update, calibration=found, observations=followed.observations)
+
+
+def _by_feet(job: SolverJob) -> Update:
+    """The last answer, with a warning of a camera that was turned. Raises Refused without a scale: feet tell none."""
+    from hub.calibration.people.feet import level_ground
+    from hub.calibration.people.turned_camera import turned_people
+
+    last = job.last
+    assert last is not None
+    people = [one for one in job.people if one.camera in last.cameras]
+    if last.scale != "metric" or not any(d.head and d.foot for one in people for d in one.detections):
+        raise Refused("people test only a metric calibration, and by their heads and feet")
+    ground = level_ground(people, last, stated_up(job.rig, last.cameras))
+    return Update(replace(last, refused={}, warnings=turned_people(people, last, *ground)))
 
 
 def _at_its_lags(

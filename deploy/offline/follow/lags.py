@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hub.calibration.people.feet import FRAMES, GROUNDS, MIN_LOOKED_AT, WITHIN, at_same_time, on_ground, seen_feet
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.target_models import PERSON
 from protocols.geometry.pose import Pose
@@ -20,14 +21,6 @@ from protocols.session.rig import METRES_PER_UNIT
 if TYPE_CHECKING:
     from deploy.offline.follow.calibration import GivenCalibration
 
-FRAMES = 60
-"""Frames that are looked at, spread over the session: some hundred people."""
-WITHIN = 0.35
-"""Distance, as a share of a person's height, within which the feet that two cameras see are one person's: 0.6 m, which
-somebody walks between two frames 0.4 s apart."""
-SAME_TIME_NS = 250_000_000  # a camera at 2 Hz has a frame as near as this to every chosen moment
-_MOST_AT_ONCE = 20  # or three times as many as usual: frames with more false boxes than people would fill gigabytes
-MIN_LOOKED_AT = 30  # of what one camera sees where another one looks: a share of fewer says nothing
 _SHIFT_S = 0.2  # within which a car at 10 m/s drives half its length
 _SHIFTS_S: Floats = _SHIFT_S * np.arange(-75.0, 76.0)
 """Lags [s] that are tried: up to what videos that are started by hand differ by."""
@@ -35,9 +28,6 @@ _IS_GIVEN = np.abs(_SHIFTS_S) <= 2 * _SHIFT_S  # which of them are as good as no
 _MIN_IN_PLANE = 0.5
 """Share of one camera's boxes with one of the other's in the epipolar plane, at the best lag, that is no chance: with
 at most half of it at the given one, none of 17 simulated rigs with right offsets was warned of, 38 of 68 others."""
-GROUNDS: Floats = np.arange(-4.0, 5.0) / 10.0
-"""Heights of the ground that are tried, in people's heights from where people of 1.7 m would stand. Of the crowd it is
-0.1, by which places at 20 m are 1 m off: there all 21 pairs of cameras see the same people, elsewhere one to five."""
 _MIN_MET_THERE, _MIN_OF_BEST = 0.3, 0.5
 """Share of people of one camera who are where another one sees somebody, at the best lag, that is no chance; and the
 share of that at the given lag from which on this is right. Of 30 recordings of simulated rooms with right
@@ -147,43 +137,6 @@ def _other_lags(pairs: Mapping[tuple[str, str], Floats], what: str, least: float
         )
         shifted = {pair: shift for pair, shift in shifted.items() if name not in pair}
     return tuple(out)
-
-
-def seen_feet(camera: CameraCalibration, messages: Sequence[pb.Observation]) -> tuple[Floats, Floats]:
-    """Reference times (n,) [s] of a camera's frames with people, and unit vectors to their feet (n, k, 3) in its axes;
-    NaN where a frame has fewer."""
-    tracked = TrackingCamera.from_calibration(camera)
-    frames = sorted(
-        (tracked.reference_ns(one.device_time_ns) * 1e-9, feet)
-        for one in messages
-        if one.camera == camera.name and (feet := [(*d.foot,) for d in one.detections if d.head and d.foot])
-    )
-    most = max(_MOST_AT_ONCE, 3 * float(np.median([len(feet) for _, feet in frames] or [0])))
-    frames = [(time, feet) for time, feet in frames if len(feet) <= most]
-    counts = np.array([len(feet) for _, feet in frames], dtype=np.int64)
-    rays = np.full((len(frames), max(counts, default=0), 3), np.nan)
-    if frames:
-        found = camera.intrinsics.unproject(np.concatenate([feet for _, feet in frames]))
-        found = np.hstack([found, np.ones((len(found), 1))])
-        rays[np.arange(rays.shape[1]) < counts[:, None]] = found / np.linalg.norm(found, axis=1, keepdims=True)
-    return np.array([time for time, _ in frames]), rays
-
-
-def on_ground(pose: Pose, rays: Floats, up: Floats, ground: float) -> Floats:
-    """Where rays (…, 3) in a camera's axes meet level ground that lies so far along ``up``; NaN for those that never
-    do."""
-    directions = rays @ pose.rotation
-    with np.errstate(divide="ignore", invalid="ignore"):
-        away = (ground - pose.position @ up) / (directions @ up)
-    away = np.where(away > 0.0, away, np.nan)
-    return np.asarray(pose.position + away[..., None] * directions)
-
-
-def at_same_time(wanted: Floats, others: Floats) -> tuple[Ints, Bools]:
-    """The frames (n,) nearest to wanted times (n,) [s] among others, ascending, and whether they are near enough."""
-    after = np.clip(np.searchsorted(others, wanted), 1, len(others) - 1)
-    nearest = after - (wanted - others[after - 1] < others[after] - wanted)
-    return nearest, np.asarray(np.abs(others[nearest] - wanted) * 1e9 <= SAME_TIME_NS)
 
 
 def _vehicle_rays(camera: CameraCalibration, messages: Sequence[pb.Observation]) -> tuple[Floats, Floats, Floats]:

@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from deploy.offline.follow.lags import (
+from deploy.offline.follow.lags import shifted_people, shifted_vehicles
+from hub.calibration.people.feet import (
     FRAMES,
     MIN_LOOKED_AT,
     SAME_TIME_NS,
     WITHIN,
-    shifted_people,
-    shifted_vehicles,
+    distance_per_height,
+    vertical,
 )
-from deploy.offline.follow.poses import turned_people
+from hub.calibration.people.turned_camera import turned_people
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.target_models import PERSON
 from protocols.core.errors import InputError
@@ -115,8 +116,9 @@ def check_units(
     ):
         nowhere = _nowhere(bodies[0], [known.calibration.cameras[name] for name in people], height)
         ground = float(np.median((bodies[0].centre + height * bodies[0].foot) @ bodies[0].up))
-        where = messages, known, bodies[0].up, ground
-        return turned_people(*where) or nowhere or shifted_people(*where)
+        where = bodies[0].up, ground
+        turned = turned_people(messages, known.calibration, *where)
+        return turned or nowhere or shifted_people(messages, known, *where)
     raise _refusal(_MISTAKES[best], bodies[best].up, known, session)
 
 
@@ -248,10 +250,8 @@ def _bodies(people: Mapping[str, Floats], known: GivenCalibration, wrong: _Mista
     owner, centre, time, head, foot = (np.concatenate(part) for part in zip(*rays, strict=True))
     up = None if wrong.up else known.up
     if up is None:
-        normal = np.nan_to_num(np.cross(head, foot))
-        up = np.linalg.eigh(normal.T @ normal)[1][:, 0]
-        up = up * np.sign(np.nan_to_num(head - foot).sum(axis=0) @ up)
-    distance = _distance_per_height(head, foot, up)
+        up = vertical(head, foot)
+    distance = distance_per_height(head, foot, up)
     good = np.isfinite(distance) & (distance > 0.0)
     return _Bodies(time[good], owner[good], centre[good], (distance[:, None] * foot)[good], up)
 
@@ -315,16 +315,6 @@ def _nowhere(bodies: _Bodies, cameras: Sequence[CameraCalibration], height: floa
         f"of {count} people whom one camera sees where others look, others see {met} there: are the calibration's "
         "picture sizes, poses, time offsets and units those of these detections?",
     )
-
-
-def _distance_per_height(head: Floats, foot: Floats, up: Floats) -> Floats:
-    """Distances (n,) along rays (n, 3) to the feet at which upright bodies of height 1 fit the rays to their heads."""
-    # s·foot + up = t·head: without the part along ``head``, least squares for s.
-    head = head / np.linalg.norm(head, axis=1, keepdims=True)
-    across = foot - (foot * head).sum(axis=1, keepdims=True) * head
-    wanted = up - (head @ up)[:, None] * head
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(-(across * wanted).sum(axis=1) / (across**2).sum(axis=1))
 
 
 def _line_of(known: GivenCalibration, *patterns: str) -> int:

@@ -12,6 +12,9 @@ import tomli_w
 
 from deploy.cli import run
 from deploy.demo.people import score_log
+from deploy.offline.exchange import session_log
+from deploy.offline.follow.calibration import read_given_calibration
+from deploy.offline.follow.source import read_follow_input
 from deploy.simulation.session import camera_tables
 from edge import scenes
 from edge.scenes.people.scene import PeopleScene
@@ -33,6 +36,7 @@ from protocols.session.calibration import Calibration, read_calibration
 from protocols.session.rig import Rig, RigCamera
 from protocols.topics import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
 from tests.support import rigs
+from tests.support.crowds import NAMES, boxes_csv, lens, write_calibration
 from tests.support.people_traffic import Traffic, film
 from tests.support.samples import camera_info, eventually
 from tests.support.threads import running
@@ -253,6 +257,34 @@ def test_a_given_calibration_is_tested_by_people_where_there_is_no_marker(
     found, reason = hub.state(1.0)
     assert found == state, reason
     assert ("cam1: " in reason and "was it moved" in reason) == (turned > 0.0), reason
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.09])
+def test_people_whom_colours_do_not_tell_apart_name_a_camera_that_is_turned(tmp_path: Path, turned: float) -> None:
+    """Each test calibrated the rig anew by where people stand: 25 s of CPU for a minute of a crowd."""
+    known = read_given_calibration(write_calibration(tmp_path / "calibration.toml"))
+    (tmp_path / "boxes.csv").write_text(boxes_csv(110.0), encoding="utf-8")
+    found = read_follow_input(tmp_path / "boxes.csv", known, "person", tmp_path).observations
+    hub = LiveHub(known=KnownCalibration(known.rig, known.calibration.cameras))
+    for name in NAMES:
+        hub.handle(session_log.camera_info(known.rig, name))
+    said, next_tick = dict[float, str](), 0.0
+    for message in sorted(found, key=lambda one: one.device_time_ns):
+        at = message.device_time_ns / NANOSECONDS
+        if message.camera == "right" and at > 40.0:
+            for one in message.detections:
+                for point in (one.head, one.foot):
+                    point[0] += turned * lens().focal
+                one.u += turned * lens().focal
+        hub.handle(message, 1e9 + at)
+        if at >= next_tick:
+            next_tick = at + 2.0
+            hub.tick(at)
+            said[at] = hub.state(at)[1]
+    named = [at for at, text in said.items() if "right: its people are 0" in text]
+    assert bool(named) == bool(turned), said
+    assert all(50.0 < at < 100.0 for at in named[:1])
+    assert turned == 0.0 or named[-1] >= 108.0
 
 
 def test_tracks_and_predictions_come_over_the_bus(traffic: Traffic, known: Path) -> None:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deploy.offline.follow.lags import (
+from hub.calibration.people.feet import (
     FRAMES,
     GROUNDS,
     MIN_LOOKED_AT,
@@ -23,11 +22,8 @@ from protocols.geometry import so3
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats
 from protocols.messages import syncline_pb2 as pb
-from protocols.session.calibration import CameraCalibration
+from protocols.session.calibration import Calibration, CameraCalibration
 from protocols.session.rig import METRES_PER_UNIT
-
-if TYPE_CHECKING:
-    from deploy.offline.follow.calibration import GivenCalibration
 
 _PEOPLE = 200  # of one camera that are looked at: three parameters of a turn are then known to 0.15°
 _BIN, _BINS = np.radians(1.5), 18  # of turns about the vertical, and up and down, that are tried: to 27°
@@ -130,14 +126,14 @@ def _mean(pairs: Mapping[tuple[str, str], tuple[float, int]], name: str = "", wi
 
 
 def turned_people(
-    messages: Sequence[pb.Observation], known: GivenCalibration, up: Floats, usual: float
+    messages: Sequence[pb.Observation], known: Calibration, up: Floats, usual: float
 ) -> tuple[str, ...]:
     """A warning where people of one camera stand elsewhere than the others see them, and another pose mends it.
 
     usual: where along ``up`` (3,) the ground would be if all were of `PERSON`'s size [units of the calibration]. Of
     several such cameras, the one that mends most. Of two cameras either may be it.
     """
-    metre = 1.0 / METRES_PER_UNIT[known.calibration.units]
+    metre = 1.0 / METRES_PER_UNIT[known.units]
     grounds = usual + PERSON.size_m * metre * GROUNDS
     scene = _scene(messages, known, up, WITHIN * PERSON.size_m * metre)
     if len(scene.cameras) < 2:
@@ -161,7 +157,7 @@ def turned_people(
     if not fits or angle < _MIN_ANGLE or after - before < _MIN_LOSS * after:
         return ()
     rivals = [other for more, other, _ in found[1:] if more > _MUCH_LESS * gain]
-    off = f"{distance * METRES_PER_UNIT[known.calibration.units]:.1f} m ({np.degrees(angle):.1f}°)"
+    off = f"{distance * METRES_PER_UNIT[known.units]:.1f} m ({np.degrees(angle):.1f}°)"
     others = [one for one in scene.cameras if one != name]
     if len(others) == 1 or rivals:
         who, what = f"{name} and {(rivals or others)[0]}: their people are {off} off each other", "one of them"
@@ -170,8 +166,8 @@ def turned_people(
     return (f"{who}: {what} was turned or moved since; calibrate again",)
 
 
-def _scene(messages: Sequence[pb.Observation], known: GivenCalibration, up: Floats, within: float) -> _Scene:
-    seen = {name: seen_feet(camera, messages) for name, camera in known.calibration.cameras.items()}
+def _scene(messages: Sequence[pb.Observation], known: Calibration, up: Floats, within: float) -> _Scene:
+    seen = {name: seen_feet(camera, messages) for name, camera in known.cameras.items()}
     seen = {name: one for name, one in seen.items() if len(one[0]) > 1}
     rays = dict[tuple[str, str], tuple[Floats, Floats]]()
     for name, (times, mine) in seen.items():
@@ -181,7 +177,7 @@ def _scene(messages: Sequence[pb.Observation], known: GivenCalibration, up: Floa
         for other, (others, theirs) in seen.items():
             at, near = at_same_time(times[some], others)
             rays[name, other] = mine[some], np.where(near[:, None, None], theirs[at], np.nan)
-    cameras = {name: known.calibration.cameras[name] for name in seen}
+    cameras = {name: known.cameras[name] for name in seen}
     return _Scene(cameras, {pair: one for pair, one in rays.items() if pair[0] != pair[1]}, up, 0.0, within)
 
 
