@@ -61,9 +61,9 @@ class SolverJob:
     """A snapshot of what a hub knows.
 
     last: the answer to start from, with the cameras whose clock and pose hold; None = from scratch. search, full: of
-    cameras that are not tied, and refine_lenses: see `update_calibration`. verify: only test whether the
-    rows agree with ``last``; given: which was not solved here. people: frames of several unlabelled people; the observations are then of those associated
-    by colour. by_place: ``last`` is by where people stand: colours are not tried.
+    cameras that are not tied, and refine_lenses: see `update_calibration`. verify: only test whether the rows agree
+    with ``last``; given: which was not solved here. people: frames of several unlabelled people; the observations are
+    then of those associated by colour. by_place: ``last`` is by where people stand: colours are not tried.
     """
 
     number: int

@@ -12,7 +12,6 @@ import numpy as np
 from hub.calibration.people.feet import FRAMES, GROUNDS, MIN_LOOKED_AT, WITHIN, at_same_time, on_ground, seen_feet
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.target_models import PERSON
-from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import CameraCalibration

@@ -65,7 +65,7 @@ def at_same_time(wanted: Floats, others: Floats) -> tuple[Ints, Bools]:
 
 
 def vertical(head: Floats, foot: Floats) -> Floats:
-    """Unit vector (3,) along which people stand upright, from directions in the world to their heads and feet (n, 3)."""
+    """Unit vector (3,) along which people are upright, from directions in the world to their heads and feet (n, 3)."""
     normal = np.nan_to_num(np.cross(head, foot))
     up = np.linalg.eigh(normal.T @ normal)[1][:, 0]
     return np.asarray(up * np.sign(np.nan_to_num(head - foot).sum(axis=0) @ up))

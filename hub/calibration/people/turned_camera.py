@@ -125,9 +125,7 @@ def _mean(pairs: Mapping[tuple[str, str], tuple[float, int]], name: str = "", wi
     return sum(met for met, _ in chosen) / sum(count for _, count in chosen) if chosen else -1.0
 
 
-def turned_people(
-    messages: Sequence[pb.Observation], known: Calibration, up: Floats, usual: float
-) -> tuple[str, ...]:
+def turned_people(messages: Sequence[pb.Observation], known: Calibration, up: Floats, usual: float) -> tuple[str, ...]:
     """A warning where people of one camera stand elsewhere than the others see them, and another pose mends it.
 
     usual: where along ``up`` (3,) the ground would be if all were of `PERSON`'s size [units of the calibration]. Of
