@@ -62,10 +62,11 @@ def shifted_people(
     it would be along ``up`` (3,) if all were of `PERSON`'s size [units of the calibration].
     """
     grounds: Floats = usual + PERSON.size_m / METRES_PER_UNIT[known.calibration.units] * GROUNDS
+    seen = {name: seen_feet(one, messages) for name, one in known.calibration.cameras.items()}
 
     def most(levels: Floats, shifts: Floats) -> tuple[float, dict[tuple[str, str], Floats], float]:
         """Of these grounds the one on which most meet: their mean share in pairs of cameras, all shares, the ground."""
-        met = [_meetings(messages, known, up, ground, shifts) for ground in levels]
+        met = [_meetings(seen, known, up, ground, shifts) for ground in levels]
         means = [float(np.mean([one.max() for one in pairs.values() if one.any()] or [0.0])) for pairs in met]
         best = int(np.argmax(means))
         return means[best], met[best], float(levels[best])
@@ -78,13 +79,12 @@ def shifted_people(
 
 
 def _meetings(
-    messages: Sequence[pb.Observation], known: GivenCalibration, up: Floats, ground: float, shifts: Floats
+    feet: Mapping[str, tuple[Floats, Floats]], known: GivenCalibration, up: Floats, ground: float, shifts: Floats
 ) -> dict[tuple[str, str], Floats]:
     """`_shares` of people who are where another camera sees somebody, by pair, on ground so far along ``up``."""
-    seen = {name: seen_feet(one, messages) for name, one in known.calibration.cameras.items()}
     seen = {
         name: (times, on_ground(known.calibration.cameras[name].pose, rays, up, ground))
-        for name, (times, rays) in seen.items()
+        for name, (times, rays) in feet.items()
     }
     pairs, within = dict[tuple[str, str], Floats](), WITHIN * PERSON.size_m / METRES_PER_UNIT[known.calibration.units]
     for a, b in combinations([name for name, (times, _) in seen.items() if len(times) > 1], 2):
