@@ -26,6 +26,7 @@ from protocols.session.csv_table import read_csv_header, read_csv_table
 
 MATCH_M = 0.5
 """Largest distance on the ground [m] of a track from the person that it follows."""
+_LEVEL = 0.95  # cosine of 18° between z and the vertical: distances in x and y are those on the ground within 5 %
 _MIN_RECALL, _OTHER_FRAME = 0.5, 0.8
 """Recall below which another frame of the truth is looked for, and from which one is named."""
 _MIN_COMMON, _MIN_CORRELATION, _MIN_EXTENT_M = 10, 0.9, 2.0
@@ -89,6 +90,17 @@ def read_ground_truth(file: Path, frame_times: Mapping[int, float] | None) -> Gr
             raise InputError(what, file=file, line=table.line[row], remedy="keep one row a person a time")
     truth = GroundTruth(time, person, place)
     return truth.select(np.isfinite(time))
+
+
+def check_level(up: Floats | None, calibration: Path) -> None:
+    """Raise InputError where x and y are not along the ground. up: (3,) in the calibration's world; None = unknown."""
+    if up is not None and abs(up[2]) < _LEVEL:
+        direction = ", ".join(f"{value:.2f}" for value in up + 0.0)
+        raise InputError(
+            f"the vertical is [{direction}] in the calibration's world: x and y of a truth are not on the ground",
+            file=calibration,
+            remedy="give a calibration and a truth whose z is up, or leave out --truth",
+        )
 
 
 def parse_area(text: str) -> tuple[float, float, float, float]:
