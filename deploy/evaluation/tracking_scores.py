@@ -160,6 +160,9 @@ def score_tracks(
         ids.append(np.array([track for (track, _), kept in zip(there, near, strict=True) if kept], dtype=np.int64))
         similarity.append(np.maximum(0.0, 1.0 - distance * (0.5 / MATCH_M)))
     data = _numbered(gt_ids, ids, similarity)
+    if area is not None and not data["num_gt_dets"]:
+        what = f"no person of the truth is in the area {','.join(f'{limit:g}' for limit in area)}"
+        raise InputError(what, remedy="give --area in the calibration's world and units")
     results: dict[str, Any] = {}
     for metric in metrics:
         results |= metric.eval_sequence(data)

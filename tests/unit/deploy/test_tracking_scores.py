@@ -172,6 +172,8 @@ def test_nothing_counts_outside_the_area() -> None:
     assert (scores["truths"], scores["matches"], scores["false"]) == (1, 1, 0)
     with pytest.raises(InputError, match="--area"):
         parse_area("1,0,0,1")
+    with pytest.raises(InputError, match="no person of the truth is in the area -300,-200,0,100"):
+        score_tracks(truth, tracks, [0.0], 1.0, parse_area("-300,-200,0,100"))
 
 
 def test_no_track_at_all_scores_nothing() -> None:
