@@ -26,6 +26,7 @@ from protocols.session.csv_table import read_csv_header, read_csv_table
 
 MATCH_M = 0.5
 """Largest distance on the ground [m] of a track from the person that it follows."""
+_LEVEL = 0.95  # cosine of 18° between z and the vertical: distances in x and y are those on the ground within 5 %
 _MIN_RECALL, _OTHER_FRAME = 0.5, 0.8
 """Recall below which another frame of the truth is looked for, and from which one is named."""
 _MIN_COMMON, _MIN_CORRELATION, _MIN_EXTENT_M = 10, 0.9, 2.0
@@ -91,6 +92,17 @@ def read_ground_truth(file: Path, frame_times: Mapping[int, float] | None) -> Gr
     return truth.select(np.isfinite(time))
 
 
+def check_level(up: Floats | None, calibration: Path) -> None:
+    """Raise InputError where x and y are not along the ground. up: (3,) in the calibration's world; None = unknown."""
+    if up is not None and abs(up[2]) < _LEVEL:
+        direction = ", ".join(f"{value:.2f}" for value in up + 0.0)
+        raise InputError(
+            f"the vertical is [{direction}] in the calibration's world: x and y of a truth are not on the ground",
+            file=calibration,
+            remedy="give a calibration and a truth whose z is up, or leave out --truth",
+        )
+
+
 def parse_area(text: str) -> tuple[float, float, float, float]:
     """x0, x1, y0, y1 of ``--area``. Raises InputError."""
     remedy = "give --area x0,x1,y0,y1 in the calibration's units, as in -3,9,-9,27"
@@ -148,6 +160,9 @@ def score_tracks(
         ids.append(np.array([track for (track, _), kept in zip(there, near, strict=True) if kept], dtype=np.int64))
         similarity.append(np.maximum(0.0, 1.0 - distance * (0.5 / MATCH_M)))
     data = _numbered(gt_ids, ids, similarity)
+    if area is not None and not data["num_gt_dets"]:
+        what = f"no person of the truth is in the area {','.join(f'{limit:g}' for limit in area)}"
+        raise InputError(what, remedy="give --area in the calibration's world and units")
     results: dict[str, Any] = {}
     for metric in metrics:
         results |= metric.eval_sequence(data)

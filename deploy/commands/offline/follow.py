@@ -84,7 +84,7 @@ def follow(
         check_folder(crops)
         if kind != "person":
             raise InputError("--crops shows heads and torsos of people", remedy="leave it out for vehicles")
-    from deploy.evaluation.tracking_scores import parse_area, read_ground_truth, score_tracks, trackeval_metrics
+    from deploy.evaluation import tracking_scores as scoring
     from deploy.offline.follow.calibration import read_given_calibration
     from deploy.offline.follow.crops import check_pictures, write_crops
     from deploy.offline.follow.report import follow_report
@@ -97,13 +97,14 @@ def follow(
 
     began = _cpu_seconds()
     known = read_given_calibration(calibration)
-    limits = None if area is None else parse_area(area)
+    limits = None if area is None else scoring.parse_area(area)
     if truth is not None:
         if known.calibration.scale != "metric":
             what = "the calibration has no metric scale, and matches are within 0.5 m"
             raise InputError(what, file=calibration, remedy="give the rig a distance, or leave out --truth")
-        read_ground_truth(truth, None)  # reported before minutes of detection
-        trackeval_metrics()
+        scoring.check_level(known.up, calibration)
+        scoring.read_ground_truth(truth, None)  # reported before minutes of detection
+        scoring.trackeval_metrics()
     with progress_bar(f"reading {session.name}", quiet=json) as progress:
         source = read_follow_input(
             session,
@@ -141,8 +142,9 @@ def follow(
         warnings += unlikely_size(result.tracks, source.observations, known)
     if truth is not None:
         units_per_m = 1.0 / METRES_PER_UNIT[known.calibration.units]
-        given = read_ground_truth(truth, source.frame_times(known))
-        scores = score_tracks(given, result.tracks, times, units_per_m, limits)
+        scoring.check_level(result.up, calibration)
+        given = scoring.read_ground_truth(truth, source.frame_times(known))
+        scores = scoring.score_tracks(given, result.tracks, times, units_per_m, limits)
     command = command_line()
     written = [out / name for name in (TRACKS, RESULT, REPORT)]
     if crops is not None:

@@ -17,7 +17,7 @@ from protocols.core.files import read_text, read_toml
 from protocols.formats import colmap, keypoints, opensfm, points, toml_rigs, xml_rigs, yaml_rigs
 from protocols.formats.cameras import ForeignRig, rig_tables
 from protocols.geometry.types import Floats, Ints
-from protocols.session.folder import BOXES_FILE, RIG_FILE, write_rig
+from protocols.session.folder import BOXES_FILE, OBSERVATIONS_FILE, RIG_FILE, write_rig
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import parse_camera_table
 
@@ -54,7 +54,8 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
     files = sources
     if len(sources) == 1 and sources[0].is_dir():
         folder = sources[0]
-        if wanted == "session" or (wanted is None and ((folder / RIG_FILE).exists() or (folder / BOXES_FILE).exists())):
+        tables = (folder / name for name in (RIG_FILE, BOXES_FILE, OBSERVATIONS_FILE))
+        if wanted == "session" or (wanted is None and any(table.exists() for table in tables)):
             return ImportSource("session", [folder])
         if wanted == "colmap" or (wanted is None and colmap.is_model(folder)):
             return ImportSource("colmap", [folder])

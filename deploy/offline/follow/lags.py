@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hub.calibration.people.feet import FRAMES, GROUNDS, MIN_LOOKED_AT, WITHIN, at_same_time, on_ground, seen_feet
+from hub.calibration.people.feet import (
+    FRAMES,
+    GROUND_STEP,
+    GROUND_STEPS,
+    MIN_LOOKED_AT,
+    WITHIN,
+    at_same_time,
+    on_ground,
+    seen_feet,
+)
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.target_models import PERSON
 from protocols.geometry.types import Bools, Floats, Ints
@@ -61,7 +70,8 @@ def shifted_people(
     On level ground, where most meet at the best lags: people's mean height does not tell it well enough. usual: where
     it would be along ``up`` (3,) if all were of `PERSON`'s size [units of the calibration].
     """
-    grounds: Floats = usual + PERSON.size_m / METRES_PER_UNIT[known.calibration.units] * GROUNDS
+    step = GROUND_STEP * PERSON.size_m / METRES_PER_UNIT[known.calibration.units]
+    grounds: Floats = usual + step * np.arange(-GROUND_STEPS, GROUND_STEPS + 1.0)
     seen = {name: seen_feet(one, messages) for name, one in known.calibration.cameras.items()}
 
     def most(levels: Floats, shifts: Floats) -> tuple[float, dict[tuple[str, str], Floats], float]:

@@ -22,9 +22,11 @@ somebody walks between two frames 0.4 s apart."""
 SAME_TIME_NS = 250_000_000  # a camera at 2 Hz has a frame as near as this to every chosen moment
 _MOST_AT_ONCE = 20  # or three times as many as usual: frames with more false boxes than people would fill gigabytes
 MIN_LOOKED_AT = 30  # of what one camera sees where another one looks: a share of fewer says nothing
-GROUNDS: Floats = np.arange(-4.0, 5.0) / 10.0
-"""Heights of the ground that are tried, in people's heights from where people of 1.7 m would stand. Of the crowd it is
-0.1, by which places at 20 m are 1 m off: there all 21 pairs of cameras see the same people, elsewhere one to five."""
+BREADTH = 0.25  # of a body over its height, which adds to the length of a box seen from above
+GROUND_STEPS, GROUND_STEP = 4, 0.1
+"""Heights of the ground that are tried on either side of where it is for people of 1.7 m, and their distance in
+people's heights. Of the crowd it is 0.1, by which places at 20 m are 1 m off: there all 21 pairs of cameras see the
+same people, elsewhere one to five."""
 
 
 def seen_feet(camera: CameraCalibration, messages: Sequence[pb.Observation]) -> tuple[Floats, Floats]:
@@ -81,9 +83,17 @@ def distance_per_height(head: Floats, foot: Floats, up: Floats) -> Floats:
         return np.asarray(-(across * wanted).sum(axis=1) / (across**2).sum(axis=1))
 
 
-def level_ground(messages: Sequence[pb.Observation], known: Calibration, up: Floats | None) -> tuple[Floats, float]:
+def steepness(foot: Floats, up: Floats) -> Floats:
+    """Tangents (n,) of the angles below the horizontal at which feet are seen, by directions to them (n, 3)."""
+    below = -(foot @ up)
+    return np.asarray(below / np.sqrt(np.maximum((foot**2).sum(axis=1) - below**2, 1e-9)))
+
+
+def level_ground(
+    messages: Sequence[pb.Observation], known: Calibration, up: Floats | None
+) -> tuple[Floats, tuple[float, float]]:
     """The vertical (3,), as given or of these people, and how far along it the ground is if all have `PERSON`'s size
-    [units of the calibration]."""
+    [units of the calibration]: with the breadth of bodies, which lengthens boxes seen from above, and without it."""
     bodies = []
     for name, camera in known.cameras.items():
         mine = [d for one in messages if one.camera == name for d in one.detections if d.head and d.foot]
@@ -93,4 +103,6 @@ def level_ground(messages: Sequence[pb.Observation], known: Calibration, up: Flo
     centre, head, foot = np.split(np.concatenate(bodies), 3, axis=1)
     up = vertical(head, foot) if up is None else up
     distance = PERSON.size_m / METRES_PER_UNIT[known.units] * distance_per_height(head, foot, up)
-    return up, float(np.median(((centre + distance[:, None] * foot) @ up)[distance > 0.0]))
+    broad = distance * (1.0 + BREADTH * np.abs(steepness(foot, up)))
+    grounds = [((centre + far[:, None] * foot) @ up)[distance > 0.0] for far in (broad, distance)]
+    return up, (float(np.median(grounds[0])), float(np.median(grounds[1])))

@@ -10,7 +10,8 @@ import numpy as np
 
 from hub.calibration.people.feet import (
     FRAMES,
-    GROUNDS,
+    GROUND_STEP,
+    GROUND_STEPS,
     MIN_LOOKED_AT,
     WITHIN,
     at_same_time,
@@ -29,6 +30,7 @@ _PEOPLE = 200  # of one camera that are looked at: three parameters of a turn ar
 _BIN, _BINS = np.radians(1.5), 18  # of turns about the vertical, and up and down, that are tried: to 27°
 _ROLLS: Floats = np.radians(4.5 * np.arange(-4.0, 5.0))  # about the optical axis, within half of which most meet
 _LEVELS = 3  # from 3 m, level ground 0.1 m off is places 0.3 m off: the best of a coarse step may be a turned camera's
+_MOST_MORE = 40  # heights of the ground between two estimates: from cameras at 14 m they are up to 30
 _STARTS = 3  # turns with the most meetings that are refined
 _ROUNDS, _GATE, _NARROWER = 12, 0.12, 0.6
 """Of a fit of nearest people; the first one's largest angle [rad], and the next one's over it, down to `WITHIN`/2."""
@@ -125,14 +127,18 @@ def _mean(pairs: Mapping[tuple[str, str], tuple[float, int]], name: str = "", wi
     return sum(met for met, _ in chosen) / sum(count for _, count in chosen) if chosen else -1.0
 
 
-def turned_people(messages: Sequence[pb.Observation], known: Calibration, up: Floats, usual: float) -> tuple[str, ...]:
+def turned_people(
+    messages: Sequence[pb.Observation], known: Calibration, up: Floats, usual: tuple[float, float]
+) -> tuple[str, ...]:
     """A warning where people of one camera stand elsewhere than the others see them, and another pose mends it.
 
-    usual: where along ``up`` (3,) the ground would be if all were of `PERSON`'s size [units of the calibration]. Of
+    usual: between where along ``up`` (3,) the ground would be if all were of `PERSON`'s size [its units]. Of
     several such cameras, the one that mends most. Of two cameras either may be it.
     """
     metre = 1.0 / METRES_PER_UNIT[known.units]
-    grounds = usual + PERSON.size_m * metre * GROUNDS
+    step = GROUND_STEP * PERSON.size_m * metre
+    more = int(np.clip(np.nan_to_num((usual[1] - usual[0]) / step), 0, _MOST_MORE))
+    grounds: Floats = usual[0] + step * np.arange(-GROUND_STEPS, GROUND_STEPS + 1.0 + more)
     scene = _scene(messages, known, up, WITHIN * PERSON.size_m * metre)
     if len(scene.cameras) < 2:
         return ()

@@ -117,6 +117,21 @@ def test_a_log_of_the_boxes_is_followed_and_replayed(session: Path, followed: Pa
     assert not other.exists()
 
 
+def test_observations_of_people_need_no_rig_beside_a_calibration(session: Path, followed: Path, tmp_path: Path) -> None:
+    """`import` said that their format was unknown, and looked like observations.csv."""
+    lines = ["camera,frame,time,u,v,kind,box_x,box_y,box_w,box_h"]
+    for line in (session / "boxes.csv").read_text(encoding="utf-8").splitlines()[1:]:
+        head, (x, y, w, h) = line.split(",")[:3], (float(cell) for cell in line.split(",")[3:])
+        lines.append(",".join([*head, f"{x + w / 2!r},{y + h / 2!r},person,{x!r},{y!r},{w!r},{h!r}"]))
+    folder, log = tmp_path / "rows", tmp_path / "rows.mcap"
+    folder.mkdir()
+    (folder / "observations.csv").write_text("\n".join(lines), encoding="utf-8")
+    calibration = ["--calibration", str(session / "calibration.toml")]
+    assert run(["import", str(folder), *calibration, "--out", str(log)]) == 0
+    assert run(["follow", str(log), *calibration, "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "tracks.csv").read_bytes() == (followed / "tracks.csv").read_bytes()
+
+
 def test_videos_of_nobody_are_a_refusal_and_unknown_videos_bad_input(
     session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

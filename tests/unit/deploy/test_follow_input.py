@@ -22,6 +22,7 @@ from hub.tracking.offline import FollowedTrack
 from protocols.core.errors import InputError, Refused
 from protocols.geometry import so3
 from protocols.geometry.pose import POSE_CONVENTIONS, Pose
+from protocols.geometry.types import Floats
 from tests.support import crowds
 from tests.support.crowds import NAMES, SIZE, boxes_csv, ends, poses, write_calibration
 
@@ -541,6 +542,35 @@ def test_cameras_on_high_poles_are_no_warning(tmp_path: Path, monkeypatch: pytes
     places = np.random.default_rng(0).uniform((0.0, 0.0, 80.0), (900.0, 520.0, 200.0), (len(cells) // 4, 3))
     false = [",".join([*c[:3], f"{x},{y},{0.3 * h},{h}"]) for c, (x, y, h) in zip(cells[::4], places, strict=True)]
     assert read(tmp_path, "\n".join([header, *longer, *false])).warnings == ()
+
+
+def _broad_ends(name: str, time: float) -> tuple[Floats, Floats]:
+    """Middles of the top and of the bottom of boxes around cylinders of 0.5 m."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 24)
+    around = 0.25 * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(24)])
+    rings = np.concatenate([around, around + [0.0, 0.0, crowds.HEIGHT]])
+    points = np.hstack([crowds.places(time), np.zeros((3, 1))])[:, None] + rings
+    pixels = crowds.lens().project(poses()[name].camera_from_world(points.reshape(-1, 3))).reshape(3, -1, 2)
+    top, bottom = pixels.min(axis=1), pixels.max(axis=1)
+    middle = 0.5 * (top + bottom)
+    return np.column_stack([middle[:, 0], top[:, 1]]), np.column_stack([middle[:, 0], bottom[:, 1]])
+
+
+@pytest.mark.parametrize(
+    "stands",
+    [
+        ((-7.0, 0.0, 9.0), (7.0, 0.0, 4.0)),
+        ((-7.0, -6.0, 5.0), (7.0, -6.5, 4.0), (0.5, 8.0, 6.0)),
+    ],
+)
+def test_cameras_that_look_down_on_bodies_of_some_breadth_are_no_warning(
+    stands: tuple[tuple[float, float, float], ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each put people nearer to itself than they are: poses were doubted, or a camera was said to be turned."""
+    monkeypatch.setattr(crowds, "_STANDS", stands)
+    monkeypatch.setattr(crowds, "NAMES", NAMES[: len(stands)])
+    monkeypatch.setattr(crowds, "ends", _broad_ends)
+    assert read(tmp_path, boxes_csv(12.0)).warnings == ()
 
 
 def test_a_camera_whose_time_offset_is_years_off_is_left_out_by_name(tmp_path: Path) -> None:

@@ -12,7 +12,14 @@ import pytest
 
 from deploy.evaluation.clear_mot import EvaluationFrame, clear_mot
 from deploy.evaluation.track_scores import score
-from deploy.evaluation.tracking_scores import GroundTruth, other_frame, parse_area, read_ground_truth, score_tracks
+from deploy.evaluation.tracking_scores import (
+    GroundTruth,
+    check_level,
+    other_frame,
+    parse_area,
+    read_ground_truth,
+    score_tracks,
+)
 from deploy.offline.track import TrackedFrame
 from edge.uav.base import Estimate, TrackState
 from protocols.core.errors import InputError
@@ -148,6 +155,16 @@ def test_the_truth_of_an_image_track_in_another_convention_is_named(
     assert score(rows, lost, (640, 480))["in_frame_20px"] == 0.0
 
 
+@pytest.mark.parametrize(("up", "level"), [((0, 0, 1), True), ((0, 0.2, -0.98), True), ((0, 1, 0), False)])
+def test_a_world_whose_z_is_not_vertical_has_no_ground_in_x_and_y(up: tuple[float, ...], level: bool) -> None:
+    """With y up, tracks matched whoever was at their x, at any distance."""
+    if level:
+        check_level(np.array(up), Path("calibration.toml"))
+        return
+    with pytest.raises(InputError, match=r"vertical is \[0.00, 1.00, 0.00\].*whose z is up"):
+        check_level(np.array(up, dtype=float), Path("calibration.toml"))
+
+
 def test_nothing_counts_outside_the_area() -> None:
     truth = GroundTruth(np.zeros(2), np.arange(2), np.array([[0.0, 0.0], [50.0, 0.0]]))
     tracks = [Track(1, np.zeros(1), np.zeros((1, 3))), Track(2, np.zeros(1), np.array([[0.0, 30.0, 0.0]]))]
@@ -155,6 +172,8 @@ def test_nothing_counts_outside_the_area() -> None:
     assert (scores["truths"], scores["matches"], scores["false"]) == (1, 1, 0)
     with pytest.raises(InputError, match="--area"):
         parse_area("1,0,0,1")
+    with pytest.raises(InputError, match="no person of the truth is in the area -300,-200,0,100"):
+        score_tracks(truth, tracks, [0.0], 1.0, parse_area("-300,-200,0,100"))
 
 
 def test_no_track_at_all_scores_nothing() -> None:
