@@ -54,8 +54,7 @@ def detect_source(sources: list[Path], wanted: str | None) -> ImportSource:
     files = sources
     if len(sources) == 1 and sources[0].is_dir():
         folder = sources[0]
-        tables = (folder / name for name in (RIG_FILE, BOXES_FILE, OBSERVATIONS_FILE))
-        if wanted == "session" or (wanted is None and any(table.exists() for table in tables)):
+        if wanted == "session" or (wanted is None and _is_session(folder)):
             return ImportSource("session", [folder])
         if wanted == "colmap" or (wanted is None and colmap.is_model(folder)):
             return ImportSource("colmap", [folder])
@@ -247,6 +246,14 @@ def _kind_of(file: Path) -> str | None:
     if suffix in (".xml", ".xcp", ".mcal") or _beginning(file).lstrip().startswith("<"):
         return xml_rigs.detect_format(file)
     return points.detect_format(_beginning(file))
+
+
+def _is_session(folder: Path) -> bool:
+    """Whether it has a rig.toml, boxes, or observations (of people, without a rig) whose columns are there."""
+    if (folder / RIG_FILE).exists() or (folder / BOXES_FILE).exists():
+        return True
+    rows = folder / OBSERVATIONS_FILE
+    return rows.is_file() and {"camera", "time"} <= set(_beginning(rows).partition("\n")[0].strip().split(","))
 
 
 def _beginning(file: Path) -> str:
