@@ -306,7 +306,9 @@ def test_a_trajectory_does_not_become_a_calibration(to: str, tmp_path: Path, cap
     table = tmp_path / "trajectory.csv"
     table.write_text("time,x,y,z,std\n0.0,1.0,2.0,3.0,0.1\n")
     assert run(["export", str(table), "--to", to, "--out", str(tmp_path / "out")]) == 2
-    assert f"{table}: {to} is of calibrations, and this is a table; give the calibration.toml" in capsys.readouterr().err
+    assert (
+        f"{table}: {to} is of calibrations, and this is a table; give the calibration.toml" in capsys.readouterr().err
+    )
     assert run(["triangulate", str(tmp_path), "--calibration", str(table), "--out", str(tmp_path / "t.csv")]) == 2
     assert "this is a table, not TOML" in capsys.readouterr().err
 
