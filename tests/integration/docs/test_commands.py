@@ -57,7 +57,7 @@ def test_the_documentation_names_commands() -> None:
 def test_commands_print_json_and_accept_a_seed() -> None:
     """As docs/reference/commands.md says of all but the agents, also of those that draw nothing at random."""
     others = [name for name, place, _ in COMMANDS if not place.startswith(("agents.run", "agents.router", "site.site"))]
-    for option in ("--json", "--seed", "Example: syncline "):
+    for option in ("--json", "--seed", "Example: "):
         assert [name for name in others if option not in help_of(name) and name != "keys"] == []
 
 
