@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hub.calibration.resection.unconnected import listed
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings
 from hub.live.scheduled_hub import ScheduledHub
 from protocols.core.clocks import NANOSECONDS
@@ -61,5 +62,8 @@ def replay_through_hub(
             now_ns, site = max(now_ns, logged.log_time_ns), logged.site
             hub.handle(logged.message)
             count += publish()
+        if known is not None and calibration is not None and not known.cameras.keys() & hub.links.last_frame.keys():
+            heard = f"none of its cameras is in the log, which has {listed(sorted(hub.links.last_frame))}"
+            raise InputError(heard, file=calibration, remedy="give the calibration of the log's cameras")
         count += publish(final=True)
     return count

@@ -60,7 +60,7 @@ _MAX_GAP = 1.0  # s: the trajectory is split where no camera saw the point for l
 class CameraInput:
     """Input of the reconstruction for one camera. tracks: by label. lens_prior: prior of a lens that was not measured,
     or whose focal length has a std. readout_given: whether its readout was given, so that its times are already
-    corrected. stated_std: the median of the stds [px] that the detector states for its rows; 0 without any.
+    corrected. stated_std: the geometric mean of the stds [px] that the detector states for its rows; 0 without any.
     least_spacing: of the knots of paths [s]."""
 
     name: str

@@ -17,7 +17,7 @@ from protocols.session.observations import Observations, Track
 from protocols.session.rig import Rig, RigCamera
 
 _MAX_STD_RATIO = 10.0
-"""Ratio of a row's stated std to the camera's median beyond which it is not believed: lens errors are no smaller."""
+"""Ratio of a row's stated std to the camera's typical one beyond which it is not believed: lens errors stay."""
 _LEAST_KNOT_SPACING_S = 0.15
 """Of paths: the time constant of a silhouette's errors, whose correlation is 0.5 after 0.1 s and 0.3 after 0.2 s.
 Cross-validation takes them for motion: with knots 0.06 to 0.12 s apart clocks of seven rendered rooms were 10 ms off
@@ -212,14 +212,17 @@ def _without_clutter(track: Track, warnings: list[str]) -> Track:
 
 
 def _typical_std(tracks: list[Track]) -> float:
-    """Median std [px] that the detector states for a camera's rows; 0 without any."""
+    """Geometric mean of the stds [px] that the detector states for a camera's rows; 0 without any.
+
+    The median of rows half of which are worse than the others would be that of either half.
+    """
     known = np.concatenate([np.zeros(0), *(one.std for one in tracks if one.std is not None)])
     known = known[known > 0.0]
-    return float(np.median(known)) if len(known) else 0.0
+    return float(np.exp(np.log(known).mean())) if len(known) else 0.0
 
 
 def _relative_stds(track: Track, tracks: list[Track]) -> Floats | None:
-    """Stds (n,) of a track's rows by the detector, over the median of the camera's; None if it states none.
+    """Stds (n,) of a track's rows by the detector, over the camera's typical one; None if it states none.
 
     Only ratios count: the noise of a camera is estimated from its residuals.
     """

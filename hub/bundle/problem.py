@@ -107,6 +107,7 @@ class TrackObservations:
             use=self.use[part],
             stamp=None if self.stamp is None else self.stamp[part],
             relative_std=None if self.relative_std is None else self.relative_std[part],
+            along_std=None if self.along_std is None else self.along_std[part],
         )
 
     def renumbered(self, camera: int, label: int) -> TrackObservations:

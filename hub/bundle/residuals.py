@@ -111,11 +111,16 @@ def predict(rows: TrackObservations, camera: CameraState, path: Trajectory) -> F
     return camera.intrinsics.project(camera.pose.camera_from_world(points))
 
 
+def relative_residuals(rows: TrackObservations, camera: CameraState, path: Trajectory) -> Floats:
+    """Residuals (n, 2) [px] over the rows' relative stds; NaN where the path is undefined."""
+    residual = predict(rows, camera, path) - rows.pixels
+    return residual if rows.relative_std is None else residual / rows.relative_std[:, None]
+
+
 def residual_norms(rows: TrackObservations, camera: CameraState, path: Trajectory) -> Floats:
     """Distances (n,) [px] of rows from their predictions, over their relative stds; NaN where the path is undefined."""
-    residual = predict(rows, camera, path) - rows.pixels
-    norms = np.asarray(np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2))
-    return norms if rows.relative_std is None else norms / rows.relative_std
+    residual = relative_residuals(rows, camera, path)
+    return np.asarray(np.sqrt(residual[:, 0] ** 2 + residual[:, 1] ** 2))
 
 
 def evaluate_residuals(rows: TrackObservations, camera: CameraState, path: Trajectory) -> ResidualEvaluation:

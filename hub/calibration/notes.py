@@ -135,20 +135,23 @@ def clock_step_warnings(cameras: dict[str, CameraCalibration]) -> tuple[str, ...
     )
 
 
-def large_residuals(names: list[str], state: AdjustmentState) -> tuple[str, ...]:
+def large_residuals(cameras: dict[str, CameraCalibration], state: AdjustmentState) -> tuple[str, ...]:
     """One sentence for each camera whose residuals are no noise, though no test shows what they are.
 
-    They are larger than the others' as angles too: what blurs an image has more pixels in a larger one.
+    They are larger than the others' as angles too: what blurs an image has more pixels in a larger one; and than what
+    the detector states, if it does.
     """
-    if len(names) < 3:
+    if len(cameras) < 3:
         return ()
     angles = replace(state, sigma=state.sigma / [camera.intrinsics.focal for camera in state.cameras])
     return tuple(
         f"{name}: its residuals ({state.sigma[i]:.2g} px a coordinate) are {3.0 * state.sigma[i] / limit:.1f} times "
         "the others': its lens, its detections or its times are not what they are said to be, and its pose may be "
         "further off than its std"
-        for i, name in enumerate(names)
-        if state.sigma[i] > (limit := sigma_limit(state, i)) and angles.sigma[i] > sigma_limit(angles, i)
+        for i, (name, camera) in enumerate(cameras.items())
+        if state.sigma[i] > (limit := sigma_limit(state, i))
+        and angles.sigma[i] > sigma_limit(angles, i)
+        and not 0.0 < camera.detector_z < _MAX_Z
     )
 
 

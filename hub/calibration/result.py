@@ -215,7 +215,7 @@ def assemble_calibration(
         + clock_step_warnings(cameras)
         + wrong_detector_stds(cameras)
         + uncertain_depths(tables, state)
-        + large_residuals(names, state),
+        + large_residuals(cameras, state),
         residuals={
             name: _residual_rows(problem, state, i, time_origins[i], time_scales[i]) for i, name in enumerate(names)
         },
@@ -288,7 +288,7 @@ def _readout(rig: Rig, name: str, found: float) -> float:
 
 
 def _detector_z(prepared: PreparedSession, name: str, sigma: float) -> float:
-    """Noise of a camera's residuals [px] over the median std that its detector states; 0 where it states none."""
+    """Noise of a camera's residuals [px] over the typical std that its detector states; 0 where it states none."""
     stated = prepared.camera(name).stated_std
     return sigma / stated if stated > 0.0 else 0.0
 

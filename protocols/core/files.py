@@ -89,6 +89,8 @@ def parse_toml(text: str, file: Path) -> dict[str, Any]:
         what = "a number too large" if number else "nested too deeply or a number too large"
         raise InputError(what, file=file, line=at, remedy="write a plain TOML file") from None
     except ValueError as error:
+        if file.suffix.lower() == ".csv":
+            raise InputError("this is a table, not TOML", file=file, remedy="give a .toml file") from None
         message = str(error)
         place = re.search(r"at line (\d+)", message)
         line = int(place.group(1)) if place else len(text.splitlines()) or 1

@@ -1,8 +1,8 @@
 """Calibrations in YAML: OpenCV's FileStorage (one file per camera) and Kalibr's camchain.
 
 Kalibr: ``T_cn_cnm1`` transforms points from the previous camera's axes into this camera's, ``T_cam_imu`` from the
-body's axes, which are the world here; ``t_imu = t_cam + timeshift_cam_imu``. It has no clock rate, which is written as
-an additional key.
+body's axes, which are the world here; ``t_imu = t_cam + timeshift_cam_imu``. It has no clock rate: the shift is that in
+the middle of the recording, and the whole time map is written as additional keys.
 """
 
 from __future__ import annotations
@@ -169,10 +169,10 @@ def write_kalibr(cameras: Mapping[str, CameraCalibration], name: str = "camchain
             coefficients, warning = fit_without_k3(lens, key, "Kalibr")
             warnings += [warning] if warning else []
         a = lens.matrix
-        rate, shift = camera.time_map.clock_rate, camera.time_map.time_offset
+        rate, at = camera.time_map.clock_rate, camera.lag_time
         if rate != 1.0:
-            drift = 1e6 * (rate - 1.0)
-            warnings.append(f"Kalibr has no clock rate: {key}'s timeshift is that at its time 0 ({drift:+.1f} ppm)")
+            drift = f"{1e6 * (rate - 1.0):+.1f} ppm"
+            warnings.append(f"Kalibr has no clock rate: {key}'s timeshift is that at its time {at:.3f} s ({drift})")
         table: dict[str, Any] = {
             "cam_overlaps": [other for other in range(len(cameras)) if other != number],
             "camera_model": "pinhole",
@@ -182,10 +182,10 @@ def write_kalibr(cameras: Mapping[str, CameraCalibration], name: str = "camchain
             "resolution": [lens.width, lens.height],
             "rostopic": _ros_topic(key),
             "T_cam_imu": _homogeneous(pose.rotation, pose.translation),
-            "timeshift_cam_imu": shift,
+            "timeshift_cam_imu": camera.lag,
             "name": key,
             "clock_rate": rate,
-            "time_offset": shift,
+            "time_offset": camera.time_map.time_offset,
         }
         if before is not None:
             turn = pose.rotation @ before.rotation.T

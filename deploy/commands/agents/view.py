@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deploy.commands.common import Flag, Json, answer, open_browser
+from deploy.commands.common import Flag, Json, UnusedSeed, answer, open_browser
 from protocols.bus.settings import BusConfig
 from protocols.core.errors import EXIT_BUG, EXIT_DONE, InputError
 from protocols.core.files import read_toml
@@ -30,6 +30,7 @@ def view(
     browser: Flag = False,
     rerun: Path | None = None,
     json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Show a rig in a browser: cameras, trajectories, uncertainty, and missing coverage of each camera.
 

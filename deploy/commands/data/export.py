@@ -72,6 +72,9 @@ def export(
         raise InputError(f"a log does not become {to}", file=source, remedy=remedy)
     if to == "session" and not log:
         raise InputError("only a .mcap log becomes a session", file=source, remedy="give a log")
+    if source.suffix.lower() == ".csv" and to not in ("trc", "c3d"):
+        remedy = "give the calibration.toml, or write the trajectory with --to trc or --to c3d"
+        raise InputError(f"{to} is of calibrations, and this is a table", file=source, remedy=remedy)
     warnings: tuple[str, ...] = ()
     if log:
         check_folder(out)

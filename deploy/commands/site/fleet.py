@@ -5,10 +5,11 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from deploy.commands.common import Flag, Json, answer, check_range
+from deploy.commands.common import Flag, Json, answer, check_range, check_seed
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ def fleet(
     seconds: float | None = None,
     out: Path = Path("fleet-out"),
     json: Json = False,
+    seed: int | None = None,
 ) -> int:
     """Start all agents of a rig on this machine, supervise them, restart those that exit, and stop them in order.
 
@@ -46,13 +48,18 @@ def fleet(
         Stop this long after the first frames of all cameras; without it, run until stopped.
     out
         Folder for logs, recordings, calibrations and the fleet's state file.
+    seed
+        Of the simulated world, instead of fleet.toml's.
     """
     if action == "up":
         if rig is None:
             raise InputError("`fleet up` needs a rig", remedy="give its folder, or a shipped one's name")
         check_range("--seconds", seconds, 0.1, 1e7, "give a positive number")
-        return _up(rig, simulated, seconds, out, json)
-    if rig is not None or simulated or seconds is not None:
+        if seed is not None and not simulated:
+            raise InputError("--seed is of a simulated world", remedy="leave it out, or give --simulated")
+        check_seed(seed or 0)
+        return _up(rig, simulated, seconds, out, json, seed)
+    if rig is not None or simulated or seconds is not None or seed is not None:
         raise InputError(f"`fleet {action}` takes only --out and --json", remedy="give the --out of `fleet up`")
     if action == "down":
         from deploy.site.fleet import stop_fleet
@@ -62,13 +69,17 @@ def fleet(
     return _status(out, json)
 
 
-def _up(name: str, simulated: bool, seconds: float | None, out: Path, json: bool) -> int:
+def _up(name: str, simulated: bool, seconds: float | None, out: Path, json: bool, seed: int | None) -> int:
+    import msgspec
+
     from deploy.agents.processes import stop_on_signals
     from deploy.site.fleet import Fleet
     from deploy.site.rig_folder import find_rig, read_rig_folder
     from protocols.bus.base import BusStopped
 
     rig = read_rig_folder(find_rig(name))
+    if seed is not None:
+        rig = replace(rig, world=msgspec.structs.replace(rig.world, seed=seed))
     stop = stop_on_signals()
 
     def report(line: str) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from deploy.commands.common import Json, answer
+from deploy.commands.common import Json, UnusedSeed, answer
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED
 
 Many = Annotated[tuple[str, ...], Parameter(negative="")]
@@ -33,7 +33,7 @@ KEYS = App(
 
 
 @KEYS.command
-def init(folder: Path, /, *, site: str, json: Json = False) -> int:
+def init(folder: Path, /, *, site: str, json: Json = False, seed: UnusedSeed = 0) -> int:
     """Create the certificate authority of a new site.
 
     Example: syncline keys init keys --site yard
@@ -64,6 +64,7 @@ def issue(
     listen: Many = (),
     host: Many = (),
     json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Issue or renew an agent's certificate, and rewrite the access rules of all routers.
 
@@ -96,7 +97,7 @@ def issue(
 
 
 @KEYS.command
-def revoke(folder: Authority, /, *, role: Role, id: OfId, json: Json = False) -> int:
+def revoke(folder: Authority, /, *, role: Role, id: OfId, json: Json = False, seed: UnusedSeed = 0) -> int:
     """Revoke an agent's certificates: routers with the new rules let them neither publish nor subscribe.
 
     Zenoh does not read certificate revocation lists, so a revoked certificate can still open a connection until it
@@ -113,7 +114,7 @@ def revoke(folder: Authority, /, *, role: Role, id: OfId, json: Json = False) ->
 
 
 @KEYS.command
-def check(folder: Authority, /, *, json: Json = False) -> int:
+def check(folder: Authority, /, *, json: Json = False, seed: UnusedSeed = 0) -> int:
     """Test, over real connections on this machine, what every certificate may and may not do.
 
     It also tests which clients the router refuses, and with which message: a missing, wrong or expired certificate, and

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from deploy.commands.common import Flag, Json, Role, answer
+from deploy.commands.common import Flag, Json, Role, UnusedSeed, answer
 from protocols.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ def install(
     program: str | None = None,
     dry_run: Flag = False,
     json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Install an agent as a systemd service that starts at boot and is always restarted.
 
@@ -60,6 +61,7 @@ def uninstall(
     purge: Flag = False,
     dry_run: Flag = False,
     json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Stop agents and remove their services. Recordings and other state are kept.
 
@@ -122,6 +124,7 @@ def bundle(
     extra: list[str] | None = None,
     out: Path | None = None,
     json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Collect the wheels that a board without a network needs, and a script that installs them there.
 
@@ -173,6 +176,7 @@ def doctor(
     *,
     role: Role | None = None,
     json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Check this machine and, with a configuration, its agent: one line per check, with a remedy.
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hub.bundle.problem import AdjustmentState, CorrelatedNoise, Problem
+from hub.bundle.problem import AdjustmentState, CorrelatedNoise, Problem, UsedRows
 from hub.bundle.residuals import predict
 from hub.trajectory.splines import solve_tridiagonal
 from protocols.geometry.types import Floats
@@ -61,26 +61,31 @@ def estimate_correlated_noise(problem: Problem, state: AdjustmentState) -> Corre
     out = CorrelatedNoise(state.sigma.copy(), np.full(count, _MIN_STD_PX), np.ones(count))
     for camera in range(count):
         parts = _residuals(problem, state, camera)
-        if sum(len(time) for time, _ in parts) >= _MIN_ROWS:
+        if sum(len(time) for time, *_ in parts) >= _MIN_ROWS:
             out.white_std[camera], out.correlated_std[camera], out.time_constant[camera] = fit_maximum_likelihood(parts)
     return out
 
 
-def fit_maximum_likelihood(parts: list[tuple[Floats, Floats]]) -> tuple[float, float, float]:
-    """White std [px], correlated std [px] and time constant [s]; parts: (times (n,), residuals (n, 2)) by label."""
+def fit_maximum_likelihood(parts: list[tuple[Floats, Floats, Floats]]) -> tuple[float, float, float]:
+    """White std [px], correlated std [px] and time constant [s].
+
+    parts: times (n,), residuals (n, 2) and relative variances of the white noise (n,) by label.
+    """
 
     def minus_two_log_likelihood(share: float, time_constant: float) -> tuple[float, float]:
         """-2 log likelihood up to a constant at the optimal total variance, and that variance."""
-        white, squares, logdet, count = 1.0 - share, 0.0, 0.0, 0
-        for time, residual in parts:
+        squares, logdet, count = 0.0, 0.0, 0
+        for time, residual, relative in parts:
+            white = (1.0 - share) * relative
             process = GaussMarkov.sampled_at(time, time_constant)
             band = process.precision() / share
             # log |white I + correlated| of n samples, by the matrix determinant lemma
             logdet -= 2.0 * float(np.log(1.0 / (share * process.innovation)).sum())
             band[1] += 1.0 / white
-            smooth, pivots = solve_tridiagonal(band[1], band[0, 1:], residual / white)
-            logdet += 2.0 * float(np.log(pivots).sum()) + 2.0 * len(time) * np.log(white)
-            squares += float((residual * (residual - smooth)).sum()) / white
+            weighted = residual / white[:, None]
+            smooth, pivots = solve_tridiagonal(band[1], band[0, 1:], weighted)
+            logdet += 2.0 * float(np.log(pivots * white).sum())
+            squares += float((weighted * (residual - smooth)).sum())
             count += 2 * len(time)
         variance = squares / count
         return count * float(np.log(max(variance, 1e-300))) + logdet, variance
@@ -107,8 +112,8 @@ def fit_maximum_likelihood(parts: list[tuple[Floats, Floats]]) -> tuple[float, f
     )
 
 
-def _residuals(problem: Problem, state: AdjustmentState, camera: int) -> list[tuple[Floats, Floats]]:
-    """Times (n,) and residuals (n, 2) of each label's used rows, in order of time."""
+def _residuals(problem: Problem, state: AdjustmentState, camera: int) -> list[tuple[Floats, Floats, Floats]]:
+    """Times (n,), residuals (n, 2) and relative variances (n,) of each label's used rows, in order of time."""
     out = []
     for rows in problem.of_camera(camera):
         if np.count_nonzero(rows.use) < 8:
@@ -116,8 +121,9 @@ def _residuals(problem: Problem, state: AdjustmentState, camera: int) -> list[tu
         residual = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
         good = np.isfinite(residual).all(axis=1)
         time, residual = rows.time[rows.use][good], residual[good]
+        relative = 1.0 / UsedRows.of([rows]).relative_information[good]
         order = np.argsort(time, kind="stable")
         first = max(0, (len(order) - _MAX_ROWS) // 2)
         order = order[first : first + _MAX_ROWS]
-        out.append((time[order], residual[order]))
+        out.append((time[order], residual[order], relative[order]))
     return out

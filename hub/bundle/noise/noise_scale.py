@@ -34,7 +34,7 @@ from hub.bundle.residuals import (
     evaluate_labels,
     evaluate_residuals,
     jacobians,
-    predict,
+    relative_residuals,
     residual_norms,
 )
 from hub.bundle.smoothness_prior import SmoothnessPrior, determined_shares
@@ -259,7 +259,7 @@ def _inflation_of(problem: Problem, state: AdjustmentState, camera: int) -> floa
     for rows in problem.of_camera(camera):
         if np.count_nonzero(rows.use) < 8:
             continue
-        residual = (predict(rows, state.cameras[camera], state.trajectories[rows.label]) - rows.pixels)[rows.use]
+        residual = relative_residuals(rows, state.cameras[camera], state.trajectories[rows.label])[rows.use]
         good = np.isfinite(residual).all(axis=1)
         parts.append((rows.stamps[rows.use][good], residual[good]))
     frames = _within_frame_inflation(parts)
@@ -276,7 +276,7 @@ def score_inflation(problem: Problem, state: AdjustmentState, camera: int, min_p
         if np.count_nonzero(rows.use) >= 8:
             seen = evaluate_residuals(rows, state.cameras[camera], state.trajectories[rows.label])
             by_time = jacobians(seen, state.cameras[camera], [Column.OFFSET])[:, 3]
-            score = (seen.whitened(seen.residual) * by_time).sum(axis=0)
+            score = (seen.whitened(seen.residual) * by_time).sum(axis=0) * seen.relative_information
             parts.append((rows.stamps[rows.use][seen.valid], np.column_stack([score, score])[seen.valid]))
     frames = _within_frame_inflation(parts)
     return frames * _serial_inflation(parts, frames, min_pairs)

@@ -51,7 +51,8 @@ class _FrameRows:
     """Rows of one camera grouped by frame.
 
     frame: (n,) index of a row's frame. stamp: (m,) timestamps [s]. clock: (m, k) derivatives of a frame's time with
-    respect to the clock's parameters. residual: (n, 2) [px] at the timestamps. velocity: (n, 2) of the point [px/s].
+    respect to the clock's parameters. residual: (n, 2) [px] at the timestamps. velocity: (n, 2) of the point [px/s];
+    both over the rows' relative stds.
     """
 
     frame: Ints
@@ -187,7 +188,8 @@ def _frames(stamped: Problem, current: Problem, state: AdjustmentState, camera: 
     stamps, heights, residuals, velocities = [np.zeros(0)], [np.zeros(0)], [np.zeros((0, 2))], [np.zeros((0, 2))]
     for before, rows in zip(stamped.of_camera(camera), current.of_camera(camera), strict=True):
         seen, velocity = _velocity(rows, state)
-        residual = seen.whitened(seen.residual).T - velocity * (rows.time - before.time)[:, None]
+        residual = (seen.whitened(seen.residual) * np.sqrt(seen.relative_information)).T
+        residual -= velocity * (rows.time - before.time)[:, None]
         across = np.abs(_transverse(residual, velocity)) / np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
         good = seen.valid & np.isfinite(across) & _is_path_held(current, state, rows)
         good &= across < _OUTLIER_SIGMA * max(
@@ -227,10 +229,11 @@ def _observed_times(problem: Problem, state: AdjustmentState) -> dict[int, list[
 
 
 def _velocity(rows: TrackObservations, state: AdjustmentState) -> tuple[ResidualEvaluation, Floats]:
-    """Residuals of all rows, and their velocities (n, 2) [px/s]."""
+    """Residuals of all rows, and their velocities (n, 2) [px/s] over the rows' relative stds."""
     camera, every = state.cameras[rows.camera], rows.using(np.ones(len(rows.time), dtype=np.bool_))
     seen = evaluate_residuals(every, camera, state.trajectories[rows.label])
-    return seen, jacobians(seen, camera, [Column.OFFSET])[:, 3].T * camera.rate
+    velocity = jacobians(seen, camera, [Column.OFFSET])[:, 3] * np.sqrt(seen.relative_information)
+    return seen, velocity.T * camera.rate
 
 
 def _clock_parameters(problem: Problem, state: AdjustmentState, camera: int, stamp: Floats, height: Floats) -> Floats:

@@ -41,7 +41,10 @@ lenses 20 % off, clocks that step, wander or drift), and on two recorded rigs, w
 detectors wander, up to 3.2 at 1 px, 2.5 at 2.1 px and 1.4 at 2.2 px; a turn by one degree gains 20 at 8 px."""
 _LEAST_S = 1.0  # on each side of a move: half a second of a path gave a pose that was 22° off
 LEAST_ROWS, _MOST_ROWS = 30, 400
-"""Rows of a camera on each side of a move, as many as a camera of a network needs; of all, no more are used."""
+"""Rows of a camera on each side of a move, as many as a camera of a network needs; of all, and of the ends, no more
+are used."""
+_END_S = 4.0
+"""Of the ends more rows are used, each counting less: of 150 s evenly spaced, those of a side lasted 4 to 7 s."""
 _MARGIN_S = 0.3
 """Around a move, left out too: nobody moves a camera in an instant, and the rows were smoothed across it."""
 
@@ -169,26 +172,33 @@ def _divide(
     between them; None if one pose does."""
     samples = [(one, one.track.time, one.track.points) for one in labels]
     world, image, internal = common_rows(samples, rate, offset)
-    order = np.argsort(internal, kind="stable")[:: max(1, len(internal) // _MOST_ROWS)]
-    world, image, times = world[order], image[order], (internal[order] - offset) / rate
-    count, focal = len(times), camera.intrinsics.focal
-    least = max(MIN_POINTS, LEAST_ROWS * count // len(internal))
+    if not len(internal):
+        return None
+    order = np.argsort(internal, kind="stable")
+    times, row = (internal[order] - offset) / rate, np.arange(len(order))
+    is_end = np.minimum(times - times[0], times[-1] - times) < _END_S
+    every, often = (max(1, int(np.count_nonzero(part)) // _MOST_ROWS) for part in (times, is_end))
+    picked = np.flatnonzero((row % every == 0) | (is_end & (row % often == 0)))
+    used, weight = order[picked], np.diff(picked, append=len(order)) * len(picked) / len(order)
+    world, image, times = world[used], image[used], (internal[used] - offset) / rate
+    count, focal, least = len(times), camera.intrinsics.focal, max(MIN_POINTS, LEAST_ROWS // often)
     if count < 2 * least:
         return None
 
     def costs(part: slice) -> Floats:
         residual = resected_residuals(world[part], image[part], world, image, focal)
-        return np.asarray(np.minimum(residual, TRUNCATION_PX) ** 2)
+        return np.asarray(weight * np.minimum(residual, TRUNCATION_PX) ** 2)
 
     by_one = costs(slice(None))
     together = float(by_one.mean())
     if together < _LEAST_PX**2:
         return None  # whatever two poses explain
     cost, at = best_division(count, least, costs, (*STARTS, likely_division(by_one)))
-    if min(times[at - 1] - times[0], times[-1] - times[at]) < _LEAST_S:
-        return None
+    if at in (least, count - least) or min(times[at - 1] - times[0], times[-1] - times[at]) < _LEAST_S:
+        return None  # or the move is nearer to an end yet, and some rows beyond it would be taken for this side's
     poses = resect(world[:at], image[:at]), resect(world[at:], image[at:])
-    explained = [float((costs(part)[part] < TRUNCATION_PX**2).mean()) for part in (slice(at), slice(at, None))]
+    limit = weight * TRUNCATION_PX**2
+    explained = [float((costs(part) < limit)[part].mean()) for part in (slice(at), slice(at, None))]
     gain = together / max(cost, 1e-9)
     moved = gain >= MIN_CANDIDATE_RATIO and together - cost >= _LEAST_PX**2
     if not moved or min(explained) < MIN_INLIERS or poses[0] is None or poses[1] is None:

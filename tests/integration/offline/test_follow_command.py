@@ -99,7 +99,9 @@ def test_rows_at_another_rate_and_json(session: Path, tmp_path: Path, capsys: py
     assert times[1] - times[0] == pytest.approx(0.05)
 
 
-def test_a_log_of_the_boxes_is_followed_and_replayed(session: Path, followed: Path, tmp_path: Path) -> None:
+def test_a_log_of_the_boxes_is_followed_and_replayed(
+    session: Path, followed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     calibration = ["--calibration", str(session / "calibration.toml")]
     log = tmp_path / "boxes.mcap"
     assert run(["import", str(session), *calibration, "--out", str(log)]) == 0
@@ -114,6 +116,9 @@ def test_a_log_of_the_boxes_is_followed_and_replayed(session: Path, followed: Pa
     wrong = write_calibration(tmp_path / "mm.toml", scale=1000.0, offsets=OFFSETS)
     other = tmp_path / "other.mcap"
     assert run(["replay", str(log), "--through", "hub", "--calibration", str(wrong), "--out", str(other)]) == 2
+    wrong.write_text(re.sub("left|right|back", r"other_\g<0>", (session / "calibration.toml").read_text()))
+    assert run(["replay", str(log), "--through", "hub", "--calibration", str(wrong), "--out", str(other)]) == 2
+    assert "none of its cameras is in the log, which has back, left, right" in capsys.readouterr().err
     assert not other.exists()
 
 

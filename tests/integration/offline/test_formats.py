@@ -290,6 +290,29 @@ def test_kalibr_gets_its_keys_and_a_chain_that_agrees_with_the_poses(calibration
     assert np.array(values["cam1"]["T_cam_imu"])[0, 3] == pytest.approx(-1.1)  # metres
 
 
+def test_kalibrs_timeshift_is_that_of_the_recording(calibration: Path, tmp_path: Path, capsys: Capture) -> None:
+    """At camera time 0, of a clock that has counted 20 days at 12.5 ppm, it was 22 s off."""
+    tables = tomllib.loads(calibration.read_text())
+    tables["wide"]["lag_time"] = 1.75e6
+    calibration.write_text(tomli_w.dumps(tables))
+    values = yaml.safe_load(export(calibration, "kalibr", tmp_path / "c.yaml").read_text())
+    assert values["cam2"]["timeshift_cam_imu"] == pytest.approx(3.25 + 1.75e6 * 12.5e-6)
+    assert values["cam2"]["time_offset"] == 3.25
+    assert "wide's timeshift is that at its time 1750000.000 s (+12.5 ppm)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("to", ["kalibr", "ros", "aniposelib"])
+def test_a_trajectory_does_not_become_a_calibration(to: str, tmp_path: Path, capsys: Capture) -> None:
+    table = tmp_path / "trajectory.csv"
+    table.write_text("time,x,y,z,std\n0.0,1.0,2.0,3.0,0.1\n")
+    assert run(["export", str(table), "--to", to, "--out", str(tmp_path / "out")]) == 2
+    assert (
+        f"{table}: {to} is of calibrations, and this is a table; give the calibration.toml" in capsys.readouterr().err
+    )
+    assert run(["triangulate", str(tmp_path), "--calibration", str(table), "--out", str(tmp_path / "t.csv")]) == 2
+    assert "this is a table, not TOML" in capsys.readouterr().err
+
+
 def test_kalibr_gets_the_nearest_lens_where_it_cannot_hold_k3(
     calibration: Path, tmp_path: Path, capsys: Capture
 ) -> None:

@@ -10,7 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from deploy.site.fleet import STATE, is_running
+import pytest
+
+from deploy.cli import run
+from deploy.site.fleet import STATE, Fleet, is_running
 
 HUB = 'id = "hub"\nsite = "mini"\nrig = "rig.toml"\ninterval_s = 1.0\n'
 RIG = '[{0}]\nname = "{0}"\nsize = [640, 480]\n'
@@ -60,6 +63,15 @@ def fleet(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "deploy", "fleet", *arguments], capture_output=True, text=True, timeout=120, check=False
     )
+
+
+def test_a_fleets_world_has_the_seed_that_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, seeds = mini(tmp_path / "rig"), list[int]()
+    monkeypatch.setattr(Fleet, "run", lambda self, *_: seeds.append(self.rig.world.seed))
+    for given in ([], ["--seed", "9"]):
+        run(["fleet", "up", str(rig), "--simulated", "--seconds", "1", "--out", str(tmp_path / "out"), *given])
+    assert seeds == [3, 9]
+    assert run(["fleet", "up", str(rig), "--seed", "9"]) == 2
 
 
 def test_the_next_fleet_stops_agents_of_a_killed_one(tmp_path: Path) -> None:

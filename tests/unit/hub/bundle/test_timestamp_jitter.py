@@ -84,6 +84,24 @@ def test_exact_timestamps_change_nothing(labels: int, monkeypatch: pytest.Monkey
         assert (camera.pose.position == uncorrected.cameras[name].pose.position).all()
 
 
+@pytest.mark.parametrize("ratio", [10.0, 20.0])
+def test_rows_of_alternating_stated_noise_are_not_jitter(ratio: float) -> None:
+    """Half of the rows are ``ratio`` times noisier, and all of one camera's, as stated: jitter of 9 ms was found."""
+    session = jittery(SEED + 3, 0.0, 1)
+    clean, rng = session.observations(), np.random.default_rng(SEED)
+    tracks = {}
+    for key, track in clean.tracks.items():
+        std = np.where(np.arange(len(track)) % 2, 0.3, 0.3 * ratio) * (3.0 if key[0] == "cam3" else 1.0)
+        noise = std[:, None] * rng.normal(size=(len(track), 2))
+        tracks[key] = replace(track, pixels=track.pixels + noise, std=np.hypot(std, 0.5))
+    found = calibrate(session.rig, replace(clean, tracks=tracks))
+    assert not reported_jitters(found)
+    assert not [text for text in found.warnings if "residuals" in text]
+    for name, camera in found.cameras.items():
+        assert abs(session.clock_error(name, "cam0", camera.time_map)) <= 3.5 * camera.time_offset_std
+        assert camera.detector_z == pytest.approx(1.0, abs=0.15)
+
+
 def test_correlated_errors_are_not_reported_as_jitter() -> None:
     session = jittery(SEED + 7, 0.0, 1)
     names = np.array(session.camera)

@@ -194,6 +194,19 @@ def test_a_camera_moved_after_a_long_time_is_found_within_seconds() -> None:
     assert turned.turn_error({name: camera.pose for name, camera in update.calibration.cameras.items()}) < 0.01
 
 
+@pytest.mark.parametrize("seed", [34, 35])
+def test_a_move_is_dated_right_as_soon_as_it_is_found(seed: int) -> None:
+    """Of a long window the sides of a division lasted 4 s: rows before the move were taken for its new place's."""
+    session = simulate(seed, 4, 112, fastest=0.4)
+    last = calibrate(session.rig, until(session, 107.0))
+    turned = session.turned("cam1", 108.0, np.radians(12.0))
+    for seconds in (1.5, 2.0, 3.0):
+        update = update_calibration(session.rig, until(turned, 108.0 + seconds), last, full=False)
+        assert set(update.moved) <= {"cam1"}
+        assert all(abs(session.true_time("cam1", since) - 108.0) < 0.3 for since in update.moved.values())
+    assert update.moved
+
+
 @pytest.mark.parametrize(("seed", "angle"), [(4, 0.09), (10, 0.09), (4, -0.03), (12, 0.3)])
 def test_a_move_of_one_of_two_cameras_is_named_and_the_rows_since_then_are_used(seed: int, angle: float) -> None:
     """It is no clock step, and the path does not follow both poses."""
