@@ -92,6 +92,13 @@ def read_ground_truth(file: Path, frame_times: Mapping[int, float] | None) -> Gr
     return truth.select(np.isfinite(time))
 
 
+def check_area(truth: GroundTruth, area: tuple[float, float, float, float]) -> None:
+    """Raise InputError where nobody is in the area."""
+    if not _inside(truth.place, area).any():
+        what = f"no person of the truth is in the area {','.join(f'{limit:g}' for limit in area)}"
+        raise InputError(what, remedy="give --area in the calibration's world and units")
+
+
 def check_level(up: Floats | None, calibration: Path) -> None:
     """Raise InputError where x and y are not along the ground. up: (3,) in the calibration's world; None = unknown."""
     if up is not None and abs(up[2]) < _LEVEL:
@@ -160,9 +167,6 @@ def score_tracks(
         ids.append(np.array([track for (track, _), kept in zip(there, near, strict=True) if kept], dtype=np.int64))
         similarity.append(np.maximum(0.0, 1.0 - distance * (0.5 / MATCH_M)))
     data = _numbered(gt_ids, ids, similarity)
-    if area is not None and not data["num_gt_dets"]:
-        what = f"no person of the truth is in the area {','.join(f'{limit:g}' for limit in area)}"
-        raise InputError(what, remedy="give --area in the calibration's world and units")
     results: dict[str, Any] = {}
     for metric in metrics:
         results |= metric.eval_sequence(data)

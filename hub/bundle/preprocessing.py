@@ -214,11 +214,15 @@ def _without_clutter(track: Track, warnings: list[str]) -> Track:
 def _typical_std(tracks: list[Track]) -> float:
     """Geometric mean of the stds [px] that the detector states for a camera's rows; 0 without any.
 
-    The median of rows half of which are worse than the others would be that of either half.
+    The median of rows half of which are worse than the others would be that of either half; from it on, a std that
+    stands for "unknown" counts as any that is not believed.
     """
     known = np.concatenate([np.zeros(0), *(one.std for one in tracks if one.std is not None)])
     known = known[known > 0.0]
-    return float(np.exp(np.log(known).mean())) if len(known) else 0.0
+    if not len(known):
+        return 0.0
+    median = float(np.median(known))
+    return float(np.exp(np.log(np.clip(known, median / _MAX_STD_RATIO, median * _MAX_STD_RATIO)).mean()))
 
 
 def _relative_stds(track: Track, tracks: list[Track]) -> Floats | None:

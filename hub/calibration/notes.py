@@ -139,10 +139,12 @@ def large_residuals(cameras: dict[str, CameraCalibration], state: AdjustmentStat
     """One sentence for each camera whose residuals are no noise, though no test shows what they are.
 
     They are larger than the others' as angles too: what blurs an image has more pixels in a larger one; and than what
-    the detector states, if it does.
+    the detector states, if it does, by more than the others'.
     """
     if len(cameras) < 3:
         return ()
+    stated = [camera.detector_z for camera in cameras.values() if camera.detector_z > 0.0]
+    usual = _MAX_Z * min(1.0, float(np.median(stated or [1.0])))
     angles = replace(state, sigma=state.sigma / [camera.intrinsics.focal for camera in state.cameras])
     return tuple(
         f"{name}: its residuals ({state.sigma[i]:.2g} px a coordinate) are {3.0 * state.sigma[i] / limit:.1f} times "
@@ -151,7 +153,7 @@ def large_residuals(cameras: dict[str, CameraCalibration], state: AdjustmentStat
         for i, (name, camera) in enumerate(cameras.items())
         if state.sigma[i] > (limit := sigma_limit(state, i))
         and angles.sigma[i] > sigma_limit(angles, i)
-        and not 0.0 < camera.detector_z < _MAX_Z
+        and not 0.0 < camera.detector_z < usual
     )
 
 

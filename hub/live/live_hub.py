@@ -620,9 +620,11 @@ class LiveHub:
         tracks = {key: one for key, one in observations.tracks.items() if key[0] in present.cameras}
         observations = replace(observations, tracks=tracks)
         self._jobs += 1
-        rig = replace(self._rig, metadata={**self._rig.metadata, **rig.metadata})
+        rig = replace(self._rig, metadata=rig.metadata)
         since = {one.camera: one.device_time_ns - _CHECKED_S * NANOSECONDS for one in people}
-        people = tuple(one for one in people if one.device_time_ns > since[one.camera])
+        people = tuple(
+            one for one in people if one.camera in present.cameras and one.device_time_ns > since[one.camera]
+        )
         job = SolverJob(self._jobs, rig, observations, present, verify=True, given=True, people=people)
         self._submitted, self._submitted_at, self._submitted_boots = job, now, {}
         self.solver.submit(job, now)

@@ -181,9 +181,11 @@ def _ways(job: SolverJob) -> list[Callable[[], Update]]:
 
     An answer by colours goes on so; those whom these leave out are looked for by place with the searches over all lags.
     """
+    if job.given and job.people:
+        return [partial(_tested, job)]
     ways: list[Callable[[], Update]] = [] if job.by_place and job.people else [partial(_by_labels, job)]
     if job.compares_places:
-        ways.append(partial(_by_feet if job.given else _by_place, job))
+        ways.append(partial(_by_place, job))
     return ways
 
 
@@ -226,18 +228,34 @@ def _by_place(job: SolverJob) -> Update:
     return replace(update, calibration=found, observations=followed.observations)
 
 
+def _tested(job: SolverJob) -> Update:
+    """A given calibration without the cameras that labelled points contradict, and warnings, also by people's feet."""
+    found, refusals = list[Calibration](), list[Refused]()
+    for way in (_by_labels, _by_feet):
+        try:
+            found.append(way(job).calibration)
+        except Refused as refused:
+            if refused.permanent:
+                raise
+            refusals.append(refused)
+    if not found:
+        raise refusals[0]
+    return Update(replace(found[0], warnings=tuple(text for one in found for text in one.warnings)))
+
+
 def _by_feet(job: SolverJob) -> Update:
-    """The last answer, with a warning of a camera that was turned. Raises Refused without a scale: feet tell none."""
+    """The given calibration, with a warning of a camera that was turned. Raises Refused where people say too little."""
     from hub.calibration.people.feet import level_ground
     from hub.calibration.people.turned_camera import turned_people
 
-    last = job.last
-    assert last is not None
-    people = [one for one in job.people if one.camera in last.cameras]
-    if last.scale != "metric" or not any(d.head and d.foot for one in people for d in one.detections):
-        raise Refused("people test only a metric calibration, and by their heads and feet")
-    ground = level_ground(people, last, stated_up(job.rig, last.cameras))
-    return Update(replace(last, refused={}, warnings=turned_people(people, last, *ground)))
+    given = job.last
+    assert given is not None
+    if given.scale != "metric":
+        raise Refused("the places of people test only a metric calibration")
+    warnings = turned_people(job.people, given, *level_ground(job.people, given, stated_up(job.rig, given.cameras)))
+    if warnings is None:
+        raise Refused("too few people are where two cameras look")
+    return Update(replace(given, refused={}, warnings=warnings))
 
 
 def _at_its_lags(

@@ -103,7 +103,9 @@ def follow(
             what = "the calibration has no metric scale, and matches are within 0.5 m"
             raise InputError(what, file=calibration, remedy="give the rig a distance, or leave out --truth")
         scoring.check_level(known.up, calibration)
-        scoring.read_ground_truth(truth, None)  # reported before minutes of detection
+        stated = scoring.read_ground_truth(truth, None)  # reported before minutes of detection
+        if limits is not None:
+            scoring.check_area(stated, limits)
         scoring.trackeval_metrics()
     with progress_bar(f"reading {session.name}", quiet=json) as progress:
         source = read_follow_input(

@@ -17,6 +17,7 @@ from protocols.core.files import read_text, read_toml
 from protocols.formats import colmap, keypoints, opensfm, points, toml_rigs, xml_rigs, yaml_rigs
 from protocols.formats.cameras import ForeignRig, rig_tables
 from protocols.geometry.types import Floats, Ints
+from protocols.session.csv_table import read_csv_header
 from protocols.session.folder import BOXES_FILE, OBSERVATIONS_FILE, RIG_FILE, write_rig
 from protocols.session.observations import Observations, gather_tracks
 from protocols.session.rig import parse_camera_table
@@ -249,11 +250,12 @@ def _kind_of(file: Path) -> str | None:
 
 
 def _is_session(folder: Path) -> bool:
-    """Whether it has a rig.toml, boxes, or observations (of people, without a rig) whose columns are there."""
+    """Whether it has a rig, boxes or, beside no other tool's model, observations: of people they need no rig."""
     if (folder / RIG_FILE).exists() or (folder / BOXES_FILE).exists():
         return True
-    rows = folder / OBSERVATIONS_FILE
-    return rows.is_file() and {"camera", "time"} <= set(_beginning(rows).partition("\n")[0].strip().split(","))
+    file = folder / OBSERVATIONS_FILE
+    columns = read_csv_header(file, "observations") if file.is_file() and not colmap.is_model(folder) else []
+    return {"camera", "time"} <= set(columns)
 
 
 def _beginning(file: Path) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 
 from hub.tracking.detections import TrackingCamera
 from hub.tracking.filter.target_models import PERSON
+from protocols.core.errors import Refused
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Bools, Floats, Ints
 from protocols.messages import syncline_pb2 as pb
@@ -93,7 +94,9 @@ def level_ground(
     messages: Sequence[pb.Observation], known: Calibration, up: Floats | None
 ) -> tuple[Floats, tuple[float, float]]:
     """The vertical (3,), as given or of these people, and how far along it the ground is if all have `PERSON`'s size
-    [units of the calibration]: with the breadth of bodies, which lengthens boxes seen from above, and without it."""
+    [units of the calibration]: with the breadth of bodies, which lengthens boxes seen from above, and without it.
+    Raises Refused.
+    """
     bodies = []
     for name, camera in known.cameras.items():
         mine = [d for one in messages if one.camera == name for d in one.detections if d.head and d.foot]
@@ -104,5 +107,7 @@ def level_ground(
     up = vertical(head, foot) if up is None else up
     distance = PERSON.size_m / METRES_PER_UNIT[known.units] * distance_per_height(head, foot, up)
     broad = distance * (1.0 + BREADTH * np.abs(steepness(foot, up)))
+    if not (distance > 0.0).any():
+        raise Refused("nobody stands upright on ground that a camera sees, with head and foot")
     grounds = [((centre + far[:, None] * foot) @ up)[distance > 0.0] for far in (broad, distance)]
     return up, (float(np.median(grounds[0])), float(np.median(grounds[1])))

@@ -129,11 +129,12 @@ def _mean(pairs: Mapping[tuple[str, str], tuple[float, int]], name: str = "", wi
 
 def turned_people(
     messages: Sequence[pb.Observation], known: Calibration, up: Floats, usual: tuple[float, float]
-) -> tuple[str, ...]:
+) -> tuple[str, ...] | None:
     """A warning where people of one camera stand elsewhere than the others see them, and another pose mends it.
 
     usual: between where along ``up`` (3,) the ground would be if all were of `PERSON`'s size [its units]. Of
-    several such cameras, the one that mends most. Of two cameras either may be it.
+    several such cameras, the one that mends most. Of two cameras either may be it. None: too few people are where two
+    cameras look.
     """
     metre = 1.0 / METRES_PER_UNIT[known.units]
     step = GROUND_STEP * PERSON.size_m * metre
@@ -141,8 +142,10 @@ def turned_people(
     grounds: Floats = usual[0] + step * np.arange(-GROUND_STEPS, GROUND_STEPS + 1.0 + more)
     scene = _scene(messages, known, up, WITHIN * PERSON.size_m * metre)
     if len(scene.cameras) < 2:
-        return ()
+        return None
     scene = scene.levelled(grounds)
+    if scene.agreement() < 0.0:
+        return None
     pairs = scene.agreements()
     agreements = {name: _mean(pairs, name) for name in scene.cameras}
     suspects = [name for name, one in agreements.items() if one <= _AGREES * max(agreements.values())]

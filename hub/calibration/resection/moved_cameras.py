@@ -41,8 +41,8 @@ lenses 20 % off, clocks that step, wander or drift), and on two recorded rigs, w
 detectors wander, up to 3.2 at 1 px, 2.5 at 2.1 px and 1.4 at 2.2 px; a turn by one degree gains 20 at 8 px."""
 _LEAST_S = 1.0  # on each side of a move: half a second of a path gave a pose that was 22° off
 LEAST_ROWS, _MOST_ROWS = 30, 400
-"""Rows of a camera on each side of a move, as many as a camera of a network needs; of all, and of the ends, no more
-are used."""
+"""Rows of a camera on each side of a move, as many as a camera of a network needs; of all, and of the ends, about as
+many are used, at most twice."""
 _END_S = 4.0
 """Of the ends more rows are used, each counting less: of 150 s evenly spaced, those of a side lasted 4 to 7 s."""
 _MARGIN_S = 0.3
@@ -198,7 +198,9 @@ def _divide(
         return None  # or the move is nearer to an end yet, and some rows beyond it would be taken for this side's
     poses = resect(world[:at], image[:at]), resect(world[at:], image[at:])
     limit = weight * TRUNCATION_PX**2
-    explained = [float((costs(part) < limit)[part].mean()) for part in (slice(at), slice(at, None))]
+    explained = [
+        float(np.average((costs(part) < limit)[part], weights=weight[part])) for part in (slice(at), slice(at, None))
+    ]
     gain = together / max(cost, 1e-9)
     moved = gain >= MIN_CANDIDATE_RATIO and together - cost >= _LEAST_PX**2
     if not moved or min(explained) < MIN_INLIERS or poses[0] is None or poses[1] is None:

@@ -38,11 +38,11 @@ def command_lines(text: str) -> list[str]:
 
 
 @cache
-def help_of(name: str) -> str:
-    """What `syncline NAME --help` prints."""
+def help_of(*words: str) -> str:
+    """What `syncline WORDS --help` prints."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
-        assert run([name, "--help"]) == 0
+        assert run([*words, "--help"]) == 0
     return printed.getvalue()
 
 
@@ -59,6 +59,9 @@ def test_commands_print_json_and_accept_a_seed() -> None:
     others = [name for name, place, _ in COMMANDS if not place.startswith(("agents.run", "agents.router", "site.site"))]
     for option in ("--json", "--seed", "Example: "):
         assert [name for name in others if option not in help_of(name) and name != "keys"] == []
+    parts = re.findall(r"^│ ([a-z]+) ", help_of("keys"), re.MULTILINE)
+    assert len(parts) >= 3
+    assert [part for part in parts if "--seed" not in help_of("keys", part)] == []
 
 
 @pytest.mark.parametrize("name", sorted(NAMES))

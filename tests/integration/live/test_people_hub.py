@@ -20,7 +20,7 @@ from edge import scenes
 from edge.scenes.people.scene import PeopleScene
 from hub.live.agent import run_hub, status_message
 from hub.live.live_hub import KnownCalibration, LiveHub, LiveSettings, merge_rigs
-from hub.live.solver import SolverJob, _unlike_others
+from hub.live.solver import SolverJob, _unlike_others, run_job
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import BusConfig
 from protocols.bus.transport.zenoh_bus import open_bus
@@ -33,10 +33,11 @@ from protocols.log.read.reader import LogReader
 from protocols.log.write.writer import LogWriter
 from protocols.messages import syncline_pb2 as pb
 from protocols.session.calibration import Calibration, read_calibration
+from protocols.session.observations import Observations, Track
 from protocols.session.rig import Rig, RigCamera
 from protocols.topics import CAMERA_INFO, OBSERVATION, PREDICTION, TRACK
 from tests.support import rigs
-from tests.support.crowds import NAMES, boxes_csv, lens, write_calibration
+from tests.support.crowds import NAMES, boxes_csv, ends, lens, write_calibration
 from tests.support.people_traffic import Traffic, film
 from tests.support.samples import camera_info, eventually
 from tests.support.threads import running
@@ -285,6 +286,57 @@ def test_people_whom_colours_do_not_tell_apart_name_a_camera_that_is_turned(tmp_
     assert bool(named) == bool(turned), said
     assert all(50.0 < at < 100.0 for at in named[:1])
     assert turned == 0.0 or named[-1] >= 108.0
+
+
+def given_job(folder: Path, labelled: tuple[str, ...], turned: float, late: float = 0.0) -> SolverJob:
+    """A test of a given calibration by people, of whom two are labelled in some cameras; "back" turned and late."""
+    known = read_given_calibration(write_calibration(folder / "calibration.toml"))
+    offsets = dict.fromkeys(NAMES, 0.0) | {"back": late}
+    (folder / "boxes.csv").write_text(boxes_csv(40.0, offsets=offsets), encoding="utf-8")
+    people = read_follow_input(folder / "boxes.csv", known, "person", folder).observations
+    for one in people:
+        for person in one.detections if one.camera == "back" else ():
+            person.head[0] += turned * lens().focal
+            person.foot[0] += turned * lens().focal
+    time, rng, tracks = np.arange(200) / 5.0, np.random.default_rng(3), dict[tuple[str, str], Track]()
+    for name in labelled:
+        heads = np.array([ends(name, at)[0] for at in time]) + rng.normal(0.0, 1.0, (200, 3, 2))
+        for k in range(2):
+            stamps = time - offsets[name]
+            tracks[name, f"{k}-head"] = Track(
+                name, f"{k}-head", np.arange(200), stamps, heads[:, k], np.full(200, np.nan)
+            )
+    rig = replace(known.rig, metadata={**known.rig.metadata, "target": "person"})
+    return SolverJob(1, rig, Observations(tracks), known.calibration, verify=True, given=True, people=tuple(people))
+
+
+def test_labelled_people_and_places_both_test_a_given_calibration(tmp_path: Path) -> None:
+    """Of both answers that of more cameras was taken: a clock 2 s off, and a camera without a label, were silent."""
+    late = run_job(given_job(tmp_path, NAMES, 0.0, 2.0)).calibration
+    assert late is not None
+    assert list(late.refused) == ["back"]
+    turned = run_job(given_job(tmp_path, NAMES[:2], 0.09)).calibration
+    assert turned is not None
+    assert any(text.startswith("back: its people are 0.") for text in turned.warnings)
+    right = run_job(given_job(tmp_path, NAMES, 0.0)).calibration
+    assert right is not None
+    assert (dict(right.refused), right.warnings) == ({}, ())
+
+
+def test_too_few_people_are_no_news_of_a_given_calibration(tmp_path: Path) -> None:
+    """The fault of a camera that was named was forgotten when people had left all views but one."""
+    job = given_job(tmp_path, (), 0.09)
+    assert run_job(job).calibration is not None
+    alone = tuple(one for one in job.people if one.camera == "back")
+    lying = tuple(pb.Observation.FromString(one.SerializeToString()) for one in job.people)
+    for one in lying:
+        for person in one.detections:
+            person.head[:], person.foot[:] = list(person.foot), list(person.head)
+    for people in (alone, job.people[::60], lying):
+        answer = run_job(replace(job, people=people))
+        assert answer.calibration is None
+        assert not answer.permanent
+        assert not answer.failed
 
 
 def test_tracks_and_predictions_come_over_the_bus(traffic: Traffic, known: Path) -> None:

@@ -14,6 +14,7 @@ from deploy.evaluation.clear_mot import EvaluationFrame, clear_mot
 from deploy.evaluation.track_scores import score
 from deploy.evaluation.tracking_scores import (
     GroundTruth,
+    check_area,
     check_level,
     other_frame,
     parse_area,
@@ -173,7 +174,7 @@ def test_nothing_counts_outside_the_area() -> None:
     with pytest.raises(InputError, match="--area"):
         parse_area("1,0,0,1")
     with pytest.raises(InputError, match="no person of the truth is in the area -300,-200,0,100"):
-        score_tracks(truth, tracks, [0.0], 1.0, parse_area("-300,-200,0,100"))
+        check_area(truth, parse_area("-300,-200,0,100"))
 
 
 def test_no_track_at_all_scores_nothing() -> None:

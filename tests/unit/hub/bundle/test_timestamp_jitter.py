@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import hub.calibration.final_adjustment
+from hub.bundle.preprocessing import _typical_std
 from hub.bundle.problem import CameraState, Column, TrackObservations
 from hub.calibration.pipeline import calibrate
 from protocols.session.calibration import Calibration
@@ -100,6 +101,25 @@ def test_rows_of_alternating_stated_noise_are_not_jitter(ratio: float) -> None:
     for name, camera in found.cameras.items():
         assert abs(session.clock_error(name, "cam0", camera.time_map)) <= 3.5 * camera.time_offset_std
         assert camera.detector_z == pytest.approx(1.0, abs=0.15)
+
+
+def test_stated_stds_hide_no_camera_that_is_worse_than_the_others() -> None:
+    """Where all state 1 px, one with 1.5 px among those with 0.2 px was within what it states."""
+    session = jittery(SEED + 3, 0.0, 1)
+    clean, rng, tracks = session.observations(), np.random.default_rng(SEED), {}
+    for key, track in clean.tracks.items():
+        noise = (2.0 if key[0] == "cam3" else 0.05) * rng.normal(size=(len(track), 2))
+        tracks[key] = replace(track, pixels=track.pixels + noise, std=np.full(len(track), 2.0))
+    found = calibrate(session.rig, replace(clean, tracks=tracks))
+    assert [text[:4] for text in found.warnings if "times the others" in text] == ["cam3"]
+
+
+def test_a_std_that_means_unknown_leaves_the_others_as_stated() -> None:
+    track = next(iter(jittery(SEED + 3, 0.0, 1).observations().tracks.values()))
+    unknown = np.arange(len(track)) % 5 == 0
+    some = replace(track, std=np.where(unknown, 1e5, 0.5))
+    assert 0.5 <= _typical_std([some]) < 0.8
+    assert _typical_std([replace(track, std=np.where(unknown, np.inf, 0.5))]) == _typical_std([some])
 
 
 def test_correlated_errors_are_not_reported_as_jitter() -> None:
