@@ -239,7 +239,10 @@ def modelled_inflation(problem: Problem, state: AdjustmentState, camera: int) ->
     )
     step = float(np.median(np.concatenate([np.diff(time) for time in times])))
     correlation = float(np.exp(-step / state.correlated_noise.time_constant[camera]))
-    return 1.0 + 2.0 * correlated / (white + correlated) * correlation / max(1.0 - correlation, 1e-6)
+    weight = UsedRows.of(problem.of_camera(camera)).relative_information  # the scores' white variances are as it
+    mean, square = float(weight.mean()), float(np.square(weight).mean())
+    share = correlated * mean**2 / (white * mean + correlated * square)
+    return 1.0 + 2.0 * share * correlation / max(1.0 - correlation, 1e-6)
 
 
 @lru_cache(maxsize=2)  # every test of a solution needs it
@@ -259,7 +262,9 @@ def _inflation_of(problem: Problem, state: AdjustmentState, camera: int) -> floa
     for rows in problem.of_camera(camera):
         if np.count_nonzero(rows.use) < 8:
             continue
+        # As the rows' scores: residuals over their variances.
         residual = relative_residuals(rows, state.cameras[camera], state.trajectories[rows.label])[rows.use]
+        residual *= np.sqrt(UsedRows.of([rows]).relative_information)[:, None]
         good = np.isfinite(residual).all(axis=1)
         parts.append((rows.stamps[rows.use][good], residual[good]))
     frames = _within_frame_inflation(parts)
@@ -302,7 +307,11 @@ def _within_frame_inflation(parts: list[tuple[Floats, Floats]]) -> float:
 
 
 def _serial_inflation(parts: list[tuple[Floats, Floats]], frames: float = 1.0, min_pairs: int = _MIN_PAIRS) -> float:
-    """Inflation by autocorrelation over frames; parts: as above, in any order; frames: inflation within a frame."""
+    """Inflation by autocorrelation over frames; parts: as above, in any order; frames: inflation within a frame.
+
+    Initial positive sequence of sums of two autocorrelations (Geyer 1992, section 3.3): that of one lag may be small
+    where every second row is noisier.
+    """
     parts = [
         (time[order], residual[order].T.copy())
         for time, residual in parts
@@ -314,7 +323,7 @@ def _serial_inflation(parts: list[tuple[Floats, Floats]], frames: float = 1.0, m
     variance = float(np.mean(np.concatenate(residuals, axis=1) ** 2)) if step > 0.0 else 0.0
     if step <= 0.0 or variance <= 0.0:
         return 1.0
-    total = 1.0
+    total, correlation, squared_std = 1.0, 0.0, 0.0
     for lag in range(1, round(MAX_LAG_S / step) + 1):
         product, pairs = 0.0, 0
         for time, residual in parts:
@@ -324,8 +333,11 @@ def _serial_inflation(parts: list[tuple[Floats, Floats]], frames: float = 1.0, m
                 pairs += int(np.count_nonzero(near))
         if pairs < min_pairs:
             break
-        correlation = 0.5 * product / pairs / variance
-        if correlation < _SIGNIFICANCE_SIGMA * np.sqrt(frames / (2.0 * pairs)):
-            break
-        total += 2.0 * correlation
+        correlation += 0.5 * product / pairs / variance
+        squared_std += frames / (2.0 * pairs)
+        if lag % 2 == 0:
+            if correlation < _SIGNIFICANCE_SIGMA * np.sqrt(squared_std):
+                break
+            total += 2.0 * correlation
+            correlation = squared_std = 0.0
     return min(total, _MAX_INFLATION)

@@ -286,6 +286,12 @@ def test_stds_use_the_effective_sample_size() -> None:
     inflation = of_mean * len(time) / (WHITE**2 + CORRELATED**2)
     assert modelled_inflation(problem, state, 0) == pytest.approx(inflation, rel=0.05)
     assert modelled_inflation(problem, truth, 0) == 1.0
+    # Of rows of which the detector states different noise, that of their scores.
+    stated = np.where(np.arange(len(time)) % 2, 3.0, 1.0 / 3.0)
+    rows = (replace(problem.rows[0], relative_std=stated), *problem.rows[1:])
+    weight, covariance = stated**-2, dense(time, WHITE, CORRELATED, TIME_CONSTANT, stated)
+    inflation = float(weight @ covariance @ weight) / float(weight**2 @ np.diag(covariance))
+    assert modelled_inflation(replace(problem, rows=rows), state, 0) == pytest.approx(inflation, rel=0.1)
     prior = estimate_smoothness(problem, truth)
     long = replace(state, correlated_noise=replace(true_noise(), time_constant=np.full(CAMERAS, 20.0)))
     assert (rescale_noise(problem, long, prior).sigma > 1.5 * rescale_noise(problem, truth, prior).sigma).all()

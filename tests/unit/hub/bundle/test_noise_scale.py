@@ -75,6 +75,22 @@ def test_serial_inflation_matches_the_closed_form_of_an_ar1_process(correlation:
     assert found == pytest.approx((1.0 + correlation) / (1.0 - correlation), rel=0.15)
 
 
+@pytest.mark.parametrize("ratio", [1.0, 10.0])
+def test_serial_inflation_of_rows_of_alternating_noise_is_that_of_their_scores(ratio: float) -> None:
+    """The autocorrelation of the first lag, of a precise and a noisy row, is small: nothing was found behind it."""
+    rng, count, correlation = np.random.default_rng(3), 20_000, 0.9
+    variance = np.where(np.arange(count) % 2, 1.0, ratio**2)
+    common: Floats = np.zeros((count, 2))
+    for i in range(1, count):
+        common[i] = correlation * common[i - 1] + np.sqrt(1.0 - correlation**2) * rng.normal(size=2)
+    off = np.sqrt(variance)[:, None] * rng.normal(size=(count, 2)) + common
+    found = _serial_inflation([(np.arange(count) / 30.0, off / variance[:, None])])
+    lags = np.arange(200)
+    shared = correlation ** np.abs(lags[:, None] - lags) / np.outer(variance[:200], variance[:200])
+    single = 1.0 / variance[:200]
+    assert found == pytest.approx((single.sum() + shared.sum()) / (single.sum() + np.trace(shared)), rel=0.1)
+
+
 def test_lost_frames_and_the_order_of_rows_change_nothing() -> None:
     rng = np.random.default_rng(1)
     off = np.cumsum(rng.normal(size=(6000, 2)), axis=0)
