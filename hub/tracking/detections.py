@@ -27,8 +27,8 @@ class TrackingCamera:
     """One calibrated camera. boot_id: the boot whose clock the time map refers to; "" = any.
 
     time_std: of the time map's offset [s]. noise_px: root mean square of the calibration's residuals. readout: seconds
-    from the image's first row to its last. low, high: (2,) corners of the image without its border, in normalised
-    coordinates.
+    from the image's first row to its last. extrinsics: (12,) rotation, by rows, and position. low, high: (2,) corners
+    of the image without its border, in normalised coordinates.
     """
 
     name: str
@@ -39,11 +39,13 @@ class TrackingCamera:
     noise_px: float = 0.0
     boot_id: str = ""
     readout: float = 0.0
+    extrinsics: Floats = field(init=False)
     low: Floats = field(init=False)
     high: Floats = field(init=False)
 
     def __post_init__(self) -> None:
         lens = self.intrinsics
+        object.__setattr__(self, "extrinsics", np.concatenate([self.pose.rotation.ravel(), self.pose.position]))
         x, y = np.linspace(_BORDER, 1 - _BORDER, 9) * lens.width, np.linspace(_BORDER, 1 - _BORDER, 9) * lens.height
         edge = np.concatenate([[(u, v) for u in x for v in (y[0], y[-1])], [(u, v) for u in (x[0], x[-1]) for v in y]])
         border = lens.unproject(np.asarray(edge))

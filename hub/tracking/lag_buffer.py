@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeVar
@@ -53,6 +53,10 @@ class LagBuffer(Generic[Row, State]):
             return self._keys[-1][0]
         return None if self._base_key is None else self._base_key[0]
 
+    def count_until(self, time_ns: int) -> int:
+        """How many rows are older than a reference time."""
+        return bisect_left(self._keys, (time_ns, "", "", 0))
+
     def insert(self, row: Row) -> str:
         """Insert a row; "rows" or "reordered" if it is used, else "late" or "duplicates". `advance` processes it."""
         key, newest = row.key, self.newest_ns
@@ -78,7 +82,7 @@ class LagBuffer(Generic[Row, State]):
     def forget(self) -> None:
         """Drop the processed rows that are older than ``keep_ns``."""
         if self._keys:
-            self._drop(bisect_right(self._keys, (self._keys[-1][0] - self._keep_ns, "", "", 0)))
+            self._drop(self.count_until(self._keys[-1][0] - self._keep_ns))
 
     def commit(self) -> None:
         """Make the present state the base: the processed rows will not be processed again."""

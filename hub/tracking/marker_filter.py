@@ -18,6 +18,7 @@ from hub.tracking.association.triangulation import ROWS_PER_CAMERA, initial_moti
 from hub.tracking.filter.jerk_model import POSITION, STATE_DIM, VELOCITY, jerk_model, rts_smooth
 from hub.tracking.filter.marker_rows import MarkerRow
 from protocols.core.clocks import NANOSECONDS
+from protocols.geometry import kernels
 from protocols.geometry.pose import Similarity
 from protocols.geometry.types import Floats
 
@@ -157,19 +158,78 @@ def process_row(state: MarkerState, row: MarkerRow, coast_ns: int) -> MarkerStat
 
 
 def _update(state: MarkerState, row: MarkerRow) -> MarkerState | None:
-    """The state after an accepted row; None if it is outside the gate.
+    """The state after an accepted row; None if it is outside the gate."""
+    name, elapsed = row.camera.name, (row.reference_ns - state.time_ns) / NANOSECONDS
+    factor, rows = state.noise.get(name, (1.0, 0))
+    accepted = {**state.accepted, name: row.reference_ns}
+    cameras = sum(seen_ns > row.reference_ns - RECENT_NS for seen_ns in accepted.values())
+    filtered = _filtered_compiled if kernels.AVAILABLE else _filtered
+    found = filtered(state, row, elapsed, factor, _ITERATIONS if cameras > 1 else 1)
+    if found is None:
+        return None
+    mean, covariance, fits, excesses = found
+    kept = exp(-elapsed / _MEMORY_S)
+    log_weight = [kept * old + fit for old, fit in zip(state.log_weight, fits, strict=True)]
+    most = max(log_weight)
+    best = log_weight.index(most)
+    gain = max(1.0 / (rows + _NOISE_START), _NOISE_GAIN)
+    usual, last_ns = state.usual_std, state.accepted.get(name)
+    if cameras > 1 and (last_ns is None or state.time_ns > last_ns):  # another camera saw it since this one did
+        usual += _USUAL_GAIN * (position_std(covariance[best]) - usual)
+    psd = state.psd
+    if best != 1 and _MOVE_WEIGHT * sum(exp(one - most) for one in log_weight) < 1.0:
+        # The bank moves by one density: the outermost filter is doubled, and the opposite one is dropped.
+        keep, times = ([1, 2, 2], _PSD_STEP) if best else ([0, 0, 1], 1.0 / _PSD_STEP)
+        mean, covariance, log_weight = mean[keep], covariance[keep], [log_weight[k] for k in keep]
+        psd = scaled(psd, times)
+    return MarkerState(
+        time_ns=row.reference_ns,
+        mean=mean,
+        covariance=covariance,
+        log_weight=(log_weight[0] - most, log_weight[1] - most, log_weight[2] - most),
+        psd=psd,
+        hits=state.hits + 1,
+        accepted=accepted,
+        rejected=state.rejected,
+        noise={**state.noise, name: (max(factor * (1.0 + gain * excesses[best]), 1.0), rows + 1)},
+        usual_std=usual,
+        pending=state.pending,
+        serial=state.serial,
+    )
 
-    What is small is computed in scalars: for a handful of numbers, each array operation costs more than they do.
+
+Filtered = tuple[Floats, Floats, list[float], list[float]]
+"""Means (3, 9) and covariances (3, 9, 9) of the bank after a row; by filter, its log likelihood, and by how much the
+squared residual exceeds what the noise explains, relative to it."""
+
+
+def _filtered_compiled(
+    state: MarkerState, row: MarkerRow, elapsed: float, factor: float, iterations: int
+) -> Filtered | None:
+    """As `_filtered`."""
+    mean, covariance, out = np.empty_like(state.mean), np.empty_like(state.covariance), np.empty(2 * len(_BANK))
+    camera, given = row.camera, np.array([*state.psd, *row.point, *row.noise])
+    inside = kernels.call(
+        "filter_row", elapsed, given, state.mean, state.covariance, state.best, camera.extrinsics, camera.time_std,
+        given[3:], factor, iterations, _LINEAR, _GATE, mean, covariance, out,
+    )  # fmt: skip
+    scores = out.tolist()
+    return (mean, covariance, scores[:3], scores[3:]) if inside else None
+
+
+def _filtered(state: MarkerState, row: MarkerRow, elapsed: float, factor: float, iterations: int) -> Filtered | None:
+    """The bank after a row ``elapsed`` seconds later, linearised up to ``iterations`` times; None outside the gate.
+
+    factor: of the row's noise. What is small is computed in scalars: for a handful of numbers, each array operation
+    costs more than they do.
     """
-    camera, name = row.camera, row.camera.name
-    elapsed = (row.reference_ns - state.time_ns) / NANOSECONDS
+    camera = row.camera
     step, drift = jerk_model(elapsed)
     mean = state.mean @ step.T
     covariance = step @ state.covariance @ step.T
     covariance += np.array(state.psd)[:, None, None] * drift
     rotation, centre = camera.pose.rotation, camera.pose.position
     moved = (rotation @ (camera.time_std * mean[:, VELOCITY, None])).tolist()
-    factor, rows = state.noise.get(name, (1.0, 0))
     prior = ((mean[:, POSITION] - centre) @ rotation.T).tolist()
     behind = [number for number, (_, _, z) in enumerate(prior) if not z > 0.0]
     if behind:
@@ -182,10 +242,8 @@ def _update(state: MarkerState, row: MarkerRow) -> MarkerState | None:
                 covariance[state.best],
                 prior[state.best],
             )
-    accepted = {**state.accepted, name: row.reference_ns}
-    cameras = sum(seen_ns > row.reference_ns - RECENT_NS for seen_ns in accepted.values())
     local = prior
-    for _ in range(_ITERATIONS if cameras > 1 else 1):
+    for _ in range(iterations):
         slopes = [((1.0 / z, 0.0, -x / z**2), (0.0, 1.0 / z, -y / z**2)) for x, y, z in local]
         jacobian = np.array(slopes) @ rotation
         cross = covariance[:, :, POSITION] @ jacobian.transpose(0, 2, 1)
@@ -220,39 +278,11 @@ def _update(state: MarkerState, row: MarkerRow) -> MarkerState | None:
     # The gate of the filter with the largest density: a manoeuvre must not look like an outlier.
     if not distance < _GATE:
         return None
-    before_row, mean = mean, mean + step_to
-    if cameras == 1:
-        covariance = _with_scale_at(covariance, before_row, mean, centre)
+    before, mean = mean, mean + step_to
+    if iterations == 1:
+        covariance = _with_scale_at(covariance, before, mean, centre)
     covariance -= cross @ np.array(inverses) @ cross.transpose(0, 2, 1)
-    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    kept = exp(-elapsed / _MEMORY_S)
-    log_weight = [kept * old + fit for old, fit in zip(state.log_weight, fits, strict=True)]
-    most = max(log_weight)
-    best = log_weight.index(most)
-    gain = max(1.0 / (rows + _NOISE_START), _NOISE_GAIN)
-    usual, last_ns = state.usual_std, state.accepted.get(name)
-    if cameras > 1 and (last_ns is None or state.time_ns > last_ns):  # another camera saw it since this one did
-        usual += _USUAL_GAIN * (position_std(covariance[best]) - usual)
-    psd = state.psd
-    if best != 1 and _MOVE_WEIGHT * sum(exp(one - most) for one in log_weight) < 1.0:
-        # The bank moves by one density: the outermost filter is doubled, and the opposite one is dropped.
-        keep, times = ([1, 2, 2], _PSD_STEP) if best else ([0, 0, 1], 1.0 / _PSD_STEP)
-        mean, covariance, log_weight = mean[keep], covariance[keep], [log_weight[k] for k in keep]
-        psd = scaled(psd, times)
-    return MarkerState(
-        time_ns=row.reference_ns,
-        mean=mean,
-        covariance=covariance,
-        log_weight=(log_weight[0] - most, log_weight[1] - most, log_weight[2] - most),
-        psd=psd,
-        hits=state.hits + 1,
-        accepted=accepted,
-        rejected=state.rejected,
-        noise={**state.noise, name: (max(factor * (1.0 + gain * excesses[best]), 1.0), rows + 1)},
-        usual_std=usual,
-        pending=state.pending,
-        serial=state.serial,
-    )
+    return mean, 0.5 * (covariance + covariance.transpose(0, 2, 1)), fits, excesses
 
 
 def _with_scale_at(covariance: Floats, before: Floats, after: Floats, centre: Floats) -> Floats:

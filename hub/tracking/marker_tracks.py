@@ -261,8 +261,10 @@ class _LabelTrack:
 
     def _accepted(self, after_ns: int, until_ns: int | None) -> list[MarkerState]:
         """The states after accepted rows in a span of time; with an end, at least a sample's time apart."""
-        out, last = [], self._rows.base
-        for state in self._rows.states:
+        states = self._rows.states
+        begin = min(self._rows.count_until(after_ns), len(states))  # a state is no newer than its row
+        out, last = [], states[begin - 1] if begin else self._rows.base
+        for state in states[begin:]:
             is_new = len(state.mean) > 0 and (state.hits, state.serial) != (last.hits, last.serial)
             last = state
             if is_new and state.time_ns > after_ns:

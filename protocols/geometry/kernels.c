@@ -1184,6 +1184,224 @@ void fit_motion(integer n, const double *time, const double *positions, const do
     }
 }
 
+/* Position, velocity and acceleration in three coordinates, and their covariance. */
+enum { STATE = 9, SQUARE = 81, BANK = 3 };
+
+/* hub.tracking.filter.jerk_model.jerk_model applied to mean (9,) and covariance (9, 9). left: (9, 9) transition times
+   covariance, or null. */
+static void predict_jerk(double dt, double psd, const double *mean, const double *covariance, double *to,
+                         double *spread, double *left)
+{
+    const double half = 0.5 * dt * dt, square = dt * dt, cube = square * dt;
+    const double noise[3][3] = {{square * cube / 20.0, square * square / 8.0, cube / 6.0},
+                                {square * square / 8.0, cube / 3.0, square / 2.0},
+                                {cube / 6.0, square / 2.0, dt}};
+    double rows[SQUARE];
+    for (int i = 0; i < 3; i++) {
+        to[i] = mean[i] + dt * mean[3 + i] + half * mean[6 + i];
+        to[3 + i] = mean[3 + i] + dt * mean[6 + i];
+        to[6 + i] = mean[6 + i];
+    }
+    for (int i = 0; i < 27; i++) {
+        rows[i] = covariance[i] + dt * covariance[27 + i] + half * covariance[54 + i];
+        rows[27 + i] = covariance[27 + i] + dt * covariance[54 + i];
+        rows[54 + i] = covariance[54 + i];
+    }
+    if (left) memcpy(left, rows, sizeof rows);
+    for (int r = 0; r < STATE; r++) {
+        const double *from = rows + STATE * r;
+        double *row = spread + STATE * r;
+        for (int i = 0; i < 3; i++) {
+            row[i] = from[i] + dt * from[3 + i] + half * from[6 + i];
+            row[3 + i] = from[3 + i] + dt * from[6 + i];
+            row[6 + i] = from[6 + i];
+        }
+        for (int block = 0; block < 3; block++) row[3 * block + r % 3] += psd * noise[r / 3][block];
+    }
+}
+
+/* hub.tracking.marker_filter._with_scale_at for one filter. 0 if its covariance is singular. */
+static int keep_scale(const double *centre, const double *before, const double *after, double *covariance)
+{
+    double old[STATE], new[STATE], solved[STATE], matrix[SQUARE], information = 0.0;
+    for (int i = 0; i < STATE; i++) {
+        old[i] = solved[i] = before[i] - (i < 3 ? centre[i] : 0.0);
+        new[i] = after[i] - (i < 3 ? centre[i] : 0.0);
+    }
+    memcpy(matrix, covariance, sizeof matrix);
+    if (!solve(STATE, matrix, solved)) return 0;
+    for (int i = 0; i < STATE; i++) information += old[i] * solved[i];
+    for (int i = 0; i < STATE; i++)
+        for (int j = 0; j < STATE; j++)
+            covariance[STATE * i + j] += (new[i] * new[j] - old[i] * old[j]) / information;
+    return 1;
+}
+
+/* hub.tracking.marker_filter._filtered: three filters, mean (3, 9) and covariance (3, 9, 9), by one row. camera: its
+   rotation (3, 3) and centre. row: point, noise xx, xy, yy. out: fits and excesses (3,) of both. 0 where the row is
+   outside the gate. */
+double filter_row(double dt, const double *psd, const double *mean, const double *covariance, integer likeliest,
+                  const double *camera, double time_std, const double *row, double factor, integer linearisations,
+                  double linear, double gate, double *to, double *spread, double *out)
+{
+    const double *rotation = camera, *centre = camera + 9;
+    double moved[BANK][3], prior[BANK][3], at[BANK][3], cross[BANK][2 * STATE], inverse[BANK][3], step[BANK][STATE];
+    double distance = 0.0;
+    for (int k = 0; k < BANK; k++) {
+        double *position = to + STATE * k;
+        predict_jerk(dt, psd[k], mean + STATE * k, covariance + SQUARE * k, position, spread + SQUARE * k, 0);
+        for (int i = 0; i < 3; i++) {
+            prior[k][i] = moved[k][i] = 0.0;
+            for (int j = 0; j < 3; j++) {
+                prior[k][i] += rotation[3 * i + j] * (position[j] - centre[j]);
+                moved[k][i] += rotation[3 * i + j] * time_std * position[3 + j];
+            }
+        }
+    }
+    if (!(prior[likeliest][2] > 0.0)) return 0.0;
+    for (int k = 0; k < BANK; k++)
+        if (!(prior[k][2] > 0.0)) { /* its depth is lost: it begins again from the likeliest one */
+            memcpy(to + STATE * k, to + STATE * likeliest, STATE * sizeof *to);
+            memcpy(spread + SQUARE * k, spread + SQUARE * likeliest, SQUARE * sizeof *to);
+            memcpy(prior[k], prior[likeliest], sizeof *prior);
+        }
+    memcpy(at, prior, sizeof at);
+    for (integer pass = 0; pass < linearisations; pass++) {
+        double far = 0.0, nearest = INFINITY;
+        for (int k = 0; k < BANK; k++) {
+            const double x = at[k][0], y = at[k][1], z = at[k][2], *p = spread + SQUARE * k;
+            const double a = 1.0 / z, b = -x / (z * z), d = -y / (z * z);
+            double jacobian[2][3], su[2][2];
+            for (int j = 0; j < 3; j++) {
+                jacobian[0][j] = a * rotation[j] + b * rotation[6 + j];
+                jacobian[1][j] = a * rotation[3 + j] + d * rotation[6 + j];
+            }
+            for (int i = 0; i < STATE; i++)
+                for (int e = 0; e < 2; e++) {
+                    double sum = 0.0;
+                    for (int j = 0; j < 3; j++) sum += p[STATE * i + j] * jacobian[e][j];
+                    cross[k][2 * i + e] = sum;
+                }
+            for (int e = 0; e < 2; e++)
+                for (int f = 0; f < 2; f++) {
+                    su[e][f] = 0.0;
+                    for (int j = 0; j < 3; j++) su[e][f] += jacobian[e][j] * cross[k][2 * j + f];
+                }
+            double u = row[0] - x / z - a * (prior[k][0] - x) - b * (prior[k][2] - z);
+            double v = row[1] - y / z - a * (prior[k][1] - y) - d * (prior[k][2] - z);
+            double mu = a * moved[k][0] + b * moved[k][2], mv = a * moved[k][1] + d * moved[k][2];
+            double nuu = factor * row[2] + mu * mu, nuv = factor * row[3] + mu * mv, nvv = factor * row[4] + mv * mv;
+            double suu = su[0][0] + nuu, suv = su[0][1] + nuv, svv = su[1][1] + nvv;
+            double determinant = suu * svv - suv * suv;
+            double iuu = svv / determinant, iuv = -suv / determinant, ivv = suu / determinant;
+            double ru = iuu * u + iuv * v, rv = iuv * u + ivv * v;
+            distance = u * ru + v * rv;
+            inverse[k][0] = iuu;
+            inverse[k][1] = iuv;
+            inverse[k][2] = ivv;
+            out[k] = -0.5 * (distance + log(determinant));
+            out[BANK + k] = 0.5 * (nuu * ru * ru + 2.0 * nuv * ru * rv + nvv * rv * rv - nuu * iuu -
+                                   2.0 * nuv * iuv - nvv * ivv);
+            for (int i = 0; i < STATE; i++) step[k][i] = cross[k][2 * i] * ru + cross[k][2 * i + 1] * rv;
+            double next[3];
+            for (int i = 0; i < 3; i++) {
+                next[i] = 0.0;
+                for (int j = 0; j < 3; j++)
+                    next[i] += rotation[3 * i + j] * (to[STATE * k + j] + step[k][j] - centre[j]);
+                far = fmax(far, fabs(next[i] - at[k][i]) / z);
+            }
+            memcpy(at[k], next, sizeof next);
+            nearest = fmin(nearest, next[2]);
+        }
+        if (far < linear || !(nearest > 0.0)) break;
+    }
+    if (!(distance < gate)) return 0.0;
+    for (int k = 0; k < BANK; k++) {
+        double *p = spread + SQUARE * k, before[STATE];
+        memcpy(before, to + STATE * k, sizeof before);
+        for (int i = 0; i < STATE; i++) to[STATE * k + i] += step[k][i];
+        if (linearisations == 1 && !keep_scale(centre, before, to + STATE * k, p)) return 0.0;
+        for (int i = 0; i < STATE; i++) {
+            const double *ci = cross[k] + 2 * i;
+            double gu = ci[0] * inverse[k][0] + ci[1] * inverse[k][1];
+            double gv = ci[0] * inverse[k][1] + ci[1] * inverse[k][2];
+            for (int j = 0; j < STATE; j++) p[STATE * i + j] -= gu * cross[k][2 * j] + gv * cross[k][2 * j + 1];
+        }
+        for (int i = 0; i < STATE; i++)
+            for (int j = 0; j < i; j++)
+                p[STATE * i + j] = p[STATE * j + i] = 0.5 * (p[STATE * i + j] + p[STATE * j + i]);
+    }
+    return 1.0;
+}
+
+/* a (9, 9) times b (9, columns). */
+static void times(int columns, const double *a, const double *b, double *out)
+{
+    for (int i = 0; i < STATE; i++) {
+        double *row = out + columns * i;
+        for (int j = 0; j < columns; j++) row[j] = 0.0;
+        for (int k = 0; k < STATE; k++)
+            for (int j = 0; j < columns; j++) row[j] += a[STATE * i + k] * b[columns * k + j];
+    }
+}
+
+/* hub.tracking.filter.jerk_model.rts_smooth of states (n, 9), (n, 9, 9) at times (n,): the first ``wanted``. 0 if a
+   covariance is singular. */
+double smooth_jerk(integer n, integer wanted, const double *time, const double *psd, const double *mean,
+                   const double *covariance, double *smoothed, double *spreads)
+{
+    double next[STATE], spread[SQUARE];
+    memcpy(next, mean + STATE * (n - 1), sizeof next);
+    memcpy(spread, covariance + SQUARE * (n - 1), sizeof spread);
+    for (integer s = n - 1;; s--) {
+        if (s < wanted) {
+            memcpy(smoothed + STATE * s, next, sizeof next);
+            memcpy(spreads + SQUARE * s, spread, sizeof spread);
+        }
+        if (s == 0) return 1.0;
+        const double *m = mean + STATE * (s - 1), *p = covariance + SQUARE * (s - 1);
+        double ahead[STATE], predicted[SQUARE], scaled[SQUARE], cross[SQUARE], gain[SQUARE], turned[SQUARE];
+        double scale[STATE], off[STATE], other[SQUARE];
+        predict_jerk(time[s] - time[s - 1], psd[s], m, p, ahead, predicted, cross);
+        for (int i = 0; i < STATE; i++) scale[i] = 1.0 / sqrt(predicted[10 * i]);
+        for (int i = 0; i < STATE; i++)
+            for (int j = 0; j < STATE; j++) scaled[STATE * i + j] = predicted[STATE * i + j] * scale[i] * scale[j];
+        /* Cholesky; the gain's rows solve for the columns of transition times covariance. */
+        for (int j = 0; j < STATE; j++)
+            for (int i = j; i < STATE; i++) {
+                double sum = scaled[STATE * i + j];
+                for (int k = 0; k < j; k++) sum -= scaled[STATE * i + k] * scaled[STATE * j + k];
+                if (i == j && !(sum > 0.0)) return 0.0;
+                scaled[STATE * i + j] = i == j ? sqrt(sum) : sum / scaled[STATE * j + j];
+            }
+        for (int i = 0; i < STATE; i++) {
+            double *row = cross + STATE * i;
+            for (int c = 0; c < STATE; c++) row[c] *= scale[i];
+            for (int k = 0; k < i; k++)
+                for (int c = 0; c < STATE; c++) row[c] -= scaled[STATE * i + k] * cross[STATE * k + c];
+            for (int c = 0; c < STATE; c++) row[c] /= scaled[STATE * i + i];
+        }
+        for (int i = STATE - 1; i >= 0; i--) {
+            double *row = cross + STATE * i;
+            for (int k = i + 1; k < STATE; k++)
+                for (int c = 0; c < STATE; c++) row[c] -= scaled[STATE * k + i] * cross[STATE * k + c];
+            for (int c = 0; c < STATE; c++) row[c] /= scaled[STATE * i + i];
+        }
+        for (int i = 0; i < STATE; i++)
+            for (int c = 0; c < STATE; c++) {
+                gain[STATE * c + i] = cross[STATE * i + c] * scale[i];
+                turned[STATE * i + c] = cross[STATE * i + c] * scale[i];
+            }
+        for (int i = 0; i < STATE; i++) off[i] = next[i] - ahead[i];
+        times(1, gain, off, next);
+        for (int i = 0; i < STATE; i++) next[i] += m[i];
+        for (int i = 0; i < SQUARE; i++) spread[i] -= predicted[i];
+        times(STATE, gain, spread, other);
+        times(STATE, other, turned, spread);
+        for (int i = 0; i < SQUARE; i++) spread[i] += p[i];
+    }
+}
+
 /* A grid of values (rows, columns) whose first cell begins at (x, y). */
 typedef struct {
     double x, y, cell;

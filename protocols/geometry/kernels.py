@@ -42,6 +42,8 @@ _SIGNATURES = {
     "reduce_image": "nnnppp",
     "blurred_colours": "npnnnpp",
     "fit_motion": "nppppppppp",
+    "filter_row": "dpppnpdpdnddppp",
+    "smooth_jerk": "nnpppppp",
     "road_evidence": "nnpnnnnpnppp",
     "grid_values": "dddnnpnpp",
     "road_edges": "dddnnpnppndddnp",
@@ -58,7 +60,8 @@ def load(file: Path) -> CDLL | None:
         for name, kinds in _SIGNATURES.items():
             function = getattr(library, name)
             function.argtypes, function.restype = [_KINDS[kind] for kind in kinds], None
-        library.homography_residual.restype = library.refine_alignment.restype = c_double
+        for name in ("homography_residual", "refine_alignment", "filter_row", "smooth_jerk"):
+            getattr(library, name).restype = c_double
     except (OSError, AttributeError):
         return None
     return library

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from protocols.geometry import kernels
 from protocols.geometry.types import Floats
 
 STATE_DIM = 9  # position, velocity, acceleration
@@ -54,6 +55,10 @@ def rts_smooth(time: Floats, mean: Floats, covariance: Floats, psd: Floats, want
     Rauch, Tung, Striebel (1965); the later rows are combined in pairs (Särkkä and García-Fernández 2021). time: (n,)
     [s], in order. psd: (n,) spectral density [unit²/s⁵] of the jerk before each state; the first is unused.
     """
+    if kernels.AVAILABLE:
+        smoothed = np.empty((wanted, STATE_DIM)), np.empty((wanted, STATE_DIM, STATE_DIM))
+        if kernels.call("smooth_jerk", len(time), wanted, time, psd, mean, covariance, *smoothed):
+            return smoothed
     both = ((np.diff(time)[:, None] ** _POWERS) @ _BASIS).reshape(-1, 2 * STATE_DIM, STATE_DIM)
     step, noise = both[:, :STATE_DIM], psd[1:, None, None] * both[:, STATE_DIM:]
     cross = step @ covariance[:-1]

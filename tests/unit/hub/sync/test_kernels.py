@@ -6,6 +6,7 @@ import shutil
 import struct
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +34,18 @@ from hub.bundle.problem import CameraState, Column, TrackObservations, Trajector
 from hub.bundle.residuals import SplineSupport, StackedTrajectories, evaluate_points, jacobians
 from hub.sync.lag_scan import smallest_eigenvalues
 from hub.sync.pair_solver import solve_pair
+from hub.tracking.marker_filter import MarkerState, process_row, smooth_states
 from hub.trajectory.image_tracks import neighbour_test
 from hub.trajectory.splines import SplineBasis, fit_spline, weighted_sums
 from hub.two_view.relative_pose import homography_residual
+from protocols.core.clocks import NANOSECONDS
 from protocols.geometry import kernels, so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.validation.layouts import Layouts
 from tests.bench.pair_trials import MATRIX, Regime, make_trial
+from tests.unit.hub.tracking.test_marker_filter import cameras, row_of
 from tests.unit.protocols.test_layouts import NASTY_NUMBERS as NASTY
 from tests.unit.protocols.test_layouts import whole
 
@@ -373,3 +377,33 @@ def test_observations_match_the_same_layouts(both: Both) -> None:
     np.testing.assert_array_equal(compiled, [layouts.match(payload) for payload in payloads])
     assert 40 <= compiled.sum() < len(payloads)
     assert not alone.any(), "without kernels they are matched one by one"
+
+
+@pytest.mark.parametrize("seen_by", [1, 3])
+def test_marker_filter_and_smoother(both: Both, seen_by: int) -> None:
+    """Fast and slow, with time maps of 2 ms, outliers, and silences after which depths are lost."""
+    rng = np.random.default_rng(seen_by)
+    rig = [replace(camera, time_std=2e-3) for camera in cameras(3, 5)]
+    times = np.sort(rng.uniform(0.0, 6.0, 400))
+    times = times[(times < 3.0) | (times > 4.5)]
+    rows = []
+    for number, time in enumerate(times.tolist()):
+        camera = rig[number % (3 if time < 1.5 else seen_by)]
+        place = np.array([np.sin(2.0 * time), 0.3 * np.cos(3.0 * time), 0.2 * time])
+        row = row_of(camera, time, place, number)
+        u, v = np.array(row.point) + rng.normal(0.0, 2e-3, 2) + (rng.uniform() < 0.05)
+        rows.append(replace(row, point=(float(u), float(v)), noise=(4e-6, 1e-7, 4e-6)))
+
+    def filtered() -> Floats:
+        state, out, smoothed = MarkerState(), list[Floats](), list[MarkerState]()
+        for row in rows:
+            state = process_row(state, row, 10 * NANOSECONDS)
+            if len(state.mean):
+                smoothed.append(state)
+                out.append(np.concatenate([state.mean.ravel(), state.covariance.ravel(), state.log_weight]))
+        means, covariances = smooth_states(smoothed[-150:], 100)
+        return np.concatenate([*out, means.ravel(), covariances.ravel(), [state.noise[rig[0].name][0]]])
+
+    compiled, plain = both(filtered)
+    assert len(plain) > 300 * 250
+    np.testing.assert_allclose(compiled, plain, rtol=1e-8, atol=1e-10)
