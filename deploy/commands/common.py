@@ -6,7 +6,9 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Iterable, Mapping
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,6 +21,9 @@ Flag = Annotated[bool, Parameter(negative="")]
 Json = Annotated[bool, Parameter(negative="", help="Print the result as JSON.")]
 PrintConfig = Annotated[
     bool, Parameter(negative="", help="Print the configuration with all defaults filled in, and exit.")
+]
+StatusJson = Annotated[
+    bool, Parameter(negative="", help="Print each status, or the configuration, as a line of JSON; all else on stderr.")
 ]
 UnusedSeed = Annotated[int, Parameter(help="Accepted for consistency; this command uses no random numbers.")]
 Scheduler = Annotated[
@@ -87,6 +92,29 @@ def answer(document: Mapping[str, Any] | list[Any], lines: Iterable[str], as_jso
         for line in lines:
             print(line, flush=True)
     return EXIT_DONE
+
+
+def answer_config(config: Any, as_json: bool) -> int:
+    """Print an agent's configuration with every default filled in; returns EXIT_DONE."""
+    from deploy.config.file import effective_toml
+
+    text = effective_toml(config)
+    return answer(tomllib.loads(text), [text.removesuffix("\n")], as_json)
+
+
+@contextmanager
+def status_lines(
+    seen: Callable[[Any], None], report: Callable[[], Mapping[str, Any]]
+) -> Iterator[Callable[[Any], None]]:
+    """Passes statuses on to ``seen``, and prints ``report`` after each as a line of JSON; all else goes to stderr."""
+    out = sys.stdout
+
+    def show(status: Any) -> None:
+        seen(status)
+        print(json.dumps(report(), allow_nan=False), file=out, flush=True)
+
+    with redirect_stdout(sys.stderr):
+        yield show
 
 
 def closing_lines(warnings: Iterable[str], written: Iterable[object]) -> list[str]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from deploy.agents.processes import stop_on_signals
-from deploy.commands.common import PrintConfig
+from deploy.commands.common import PrintConfig, StatusJson, UnusedSeed, answer_config, status_lines
 from deploy.config.agents import RouterConfig
-from deploy.config.file import effective_toml, load
+from deploy.config.file import load
 from protocols.core.errors import EXIT_BUG, EXIT_DONE
 
 if TYPE_CHECKING:
@@ -22,7 +23,9 @@ _RESTARTS = "SYNCLINE_ROUTER_RESTARTS"
 """Environment variable that carries the restart count over an exec; informational only."""
 
 
-def router(config: Path, /, *, print_config: PrintConfig = False) -> int:
+def router(
+    config: Path, /, *, print_config: PrintConfig = False, json: StatusJson = False, seed: UnusedSeed = 0
+) -> int:
     """Run a router: agents in client mode connect to it, and it relays messages between them.
 
     It sends itself a test message four times a second. If none arrives for 0.9 s it restarts in place; agents
@@ -38,8 +41,7 @@ def router(config: Path, /, *, print_config: PrintConfig = False) -> int:
     """
     settings = load(config, RouterConfig)
     if print_config:
-        print(effective_toml(settings), end="")
-        return EXIT_DONE
+        return answer_config(settings, json)
     from deploy.agents.health import Health
     from deploy.agents.startup_checks import Conditions, check_startup, serve_health
     from protocols.bus.base import BusDead
@@ -64,7 +66,8 @@ def router(config: Path, /, *, print_config: PrintConfig = False) -> int:
 
     health = Health(site=settings.site, role="router", agent=settings.id)
     try:
-        with serve_health(settings, health):
+        lines = status_lines(seen, health.report) if json else nullcontext(seen)
+        with serve_health(settings, health), lines as show:
             run_router(
                 settings.bus,
                 settings.site,
@@ -74,7 +77,7 @@ def router(config: Path, /, *, print_config: PrintConfig = False) -> int:
                 restarts=restarts,
                 ready=lambda listen: print(f"relays at {', '.join(listen)}", flush=True),
                 beat=(lambda: None) if notifier is None else notifier.beat,
-                seen=seen,
+                seen=show,
             )
     except RulesChanged:
         time.sleep(0.2)  # the file was renamed into place, but more files of the same `keys issue` may follow

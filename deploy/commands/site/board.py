@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from deploy.commands.common import Json, Role, answer
+from deploy.commands.common import Json, Role, UnusedSeed, answer
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
 OfRole = Annotated[Role, Parameter(help="The agent's role.")]
@@ -16,7 +16,7 @@ OfId = Annotated[str, Parameter(help="The agent's id.")]
 Root = Annotated[Path, Parameter(help="Root folder of a system image.")]
 
 
-def image(root: Path, /, *, bundle: Path) -> int:
+def image(root: Path, /, *, bundle: Path, json: Json = False, seed: UnusedSeed = 0) -> int:
     """Put a bundle into a mounted system image; the board installs it when it first starts, without a network.
 
     Example: sudo syncline site image /mnt/pi --bundle camera-bundle
@@ -30,12 +30,19 @@ def image(root: Path, /, *, bundle: Path) -> int:
     """
     from deploy.site.boards.image import prepare_image
 
-    for line in prepare_image(root, bundle):
-        print(f"wrote {line}")
-    return EXIT_DONE
+    written = [str(line) for line in prepare_image(root, bundle)]
+    return answer({"written": written}, [f"wrote {line}" for line in written], json)
 
 
-def request(*, role: OfRole, id: OfId, out: Path | None = None, root: Root = Path("/")) -> int:
+def request(
+    *,
+    role: OfRole,
+    id: OfId,
+    out: Path | None = None,
+    root: Root = Path("/"),
+    json: Json = False,
+    seed: UnusedSeed = 0,
+) -> int:
     """On a board: make a new key, which stays here, and print a signing request for it.
 
     Example: syncline site request --role camera --id cam07 --out /media/stick/requests
@@ -50,11 +57,10 @@ def request(*, role: OfRole, id: OfId, out: Path | None = None, root: Root = Pat
 
     text = board.request(role, id, root)
     if out is None:
-        print(text, end="")
-    else:
-        write_atomically(out / f"{role}-{id}.csr", text)
-        print(f"{out / f'{role}-{id}.csr'}; sign it with: syncline site enrol site.toml --stick FOLDER")
-    return EXIT_DONE
+        return answer({"request": text}, [text.removesuffix("\n")], json)
+    file = out / f"{role}-{id}.csr"
+    write_atomically(file, text)
+    return answer({"file": str(file)}, [f"{file}; sign it with: syncline site enrol site.toml --stick FOLDER"], json)
 
 
 def accept(
@@ -65,6 +71,8 @@ def accept(
     id: str = "",
     time_server: tuple[str, ...] = (),
     root: Root = Path("/"),
+    json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """On a board: take the certificate and configuration that `site enrol` made, and install the agent.
 
@@ -92,24 +100,32 @@ def accept(
         raise InputError(f"cannot be read: {error.strerror}", file=source, remedy="check the path") from None
     if not (role or named[0] in ROLES) or not (id or named[2]):
         raise InputError("whose files these are is not known", remedy="give --role and --id")
-    for line in board.accept(role or named[0], id or named[2], unpack(content), root, time_server):
-        print(line)
-    return EXIT_DONE
+    done = board.accept(role or named[0], id or named[2], unpack(content), root, time_server)
+    return answer({"done": done}, done, json)
 
 
-def restore(*, role: OfRole, id: OfId, root: Root = Path("/")) -> int:
+def restore(*, role: OfRole, id: OfId, root: Root = Path("/"), json: Json = False, seed: UnusedSeed = 0) -> int:
     """On a board: return to certificate and configuration before the last `accept`.
 
     Example: sudo syncline site restore --role camera --id cam07
     """
     from deploy.site.boards import board
 
-    for line in board.restore(role, id, root):
-        print(line)
-    return EXIT_DONE
+    done = board.restore(role, id, root)
+    return answer({"done": done}, done, json)
 
 
-def update(bundle: Path, /, *, role: Role, id: str, patience: float = 60.0, home: Path = Path("/opt/syncline")) -> int:
+def update(
+    bundle: Path,
+    /,
+    *,
+    role: Role,
+    id: str,
+    patience: float = 60.0,
+    home: Path = Path("/opt/syncline"),
+    json: Json = False,
+    seed: UnusedSeed = 0,
+) -> int:
     """On a board: install a bundle beside the present version, switch to it, and back if the agent is not ready.
 
     The versions are in HOME/a and HOME/b; the link HOME/current is the one that runs. Exit status 3 after a return.
@@ -136,11 +152,13 @@ def update(bundle: Path, /, *, role: Role, id: str, patience: float = 60.0, home
             return True, "not enrolled yet"
         return board.ready(role, id, patience)
 
-    print(f"updated: {board.update(bundle, home, board.restart_units, is_ready)}")
-    return EXIT_DONE
+    version = board.update(bundle, home, board.restart_units, is_ready)
+    return answer({"updated": version}, [f"updated: {version}"], json)
 
 
-def ready(*, role: OfRole, id: OfId, patience: float = 0.0, root: Path = Path("/"), json: Json = False) -> int:
+def ready(
+    *, role: OfRole, id: OfId, patience: float = 0.0, root: Path = Path("/"), json: Json = False, seed: UnusedSeed = 0
+) -> int:
     """On a board: wait until the agent is ready, and print what it says. Exit status 3 if it is not.
 
     Example: syncline site ready --role camera --id cam07 --patience 60

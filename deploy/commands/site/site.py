@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from deploy.commands.common import Flag, Json, Names, Role, answer, check_range
+from deploy.commands.common import Flag, Json, Names, Role, UnusedSeed, answer, check_range
 from deploy.commands.site.board import accept, image, ready, request, restore, update
 from protocols.core.errors import EXIT_DONE, EXIT_REFUSED, InputError
 
@@ -33,7 +35,7 @@ SITE = App(
 
 
 @SITE.command
-def init(file: Path, /, *, site: str = "", cameras: int = 4, json: Json = False) -> int:
+def init(file: Path, /, *, site: str = "", cameras: int = 4, json: Json = False, seed: UnusedSeed = 0) -> int:
     """Write a site.toml to begin with, unless it is there, and make the site's certificate authority beside it.
 
     Example: syncline site init site.toml --site yard --cameras 50
@@ -68,7 +70,16 @@ def init(file: Path, /, *, site: str = "", cameras: int = 4, json: Json = False)
 
 
 @SITE.command
-def enrol(file: SiteToml, names: Names = None, /, *, stick: Path | None = None, again: Flag = False) -> int:
+def enrol(
+    file: SiteToml,
+    names: Names = None,
+    /,
+    *,
+    stick: Path | None = None,
+    again: Flag = False,
+    json: Json = False,
+    seed: UnusedSeed = 0,
+) -> int:
     """Enrol boards: each makes its own key, and gets a certificate, its configuration, and its agent installed.
 
     A private key never leaves its board. Boards that do not answer are named, and enrolled by the next run. Exit status
@@ -94,8 +105,9 @@ def enrol(file: SiteToml, names: Names = None, /, *, stick: Path | None = None, 
         wanted = [agent for agent in wanted if (stick / "requests" / f"{agent.name}.csr").is_file()]
     elif not names:
         wanted = [agent for agent in wanted if agent.host != "stick"]
-    failed = operations.enrol(site, wanted, _boards(site, stick), _report)
-    print(f"{len(wanted) - len(failed)} of {len(wanted)} enrolled")
+    failed = operations.enrol(site, wanted, _boards(site, stick), _reporter(json))
+    done = [agent.name for agent in wanted if agent.name not in failed]
+    answer({"done": done, "failed": failed}, [f"{len(done)} of {len(wanted)} enrolled"], json)
     return EXIT_REFUSED if failed else EXIT_DONE
 
 
@@ -108,6 +120,8 @@ def rollout(
     role: Role | None = None,
     bundle: Path | None = None,
     batch: Annotated[int, Parameter(name="--batch")] = 10,
+    json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Bring site.toml's configuration, or a new version, to the boards in stages, and back where one is not ready.
 
@@ -134,8 +148,8 @@ def rollout(
         raise InputError("is no bundle", file=bundle, remedy="make one with `syncline bundle`")
     check_range("--batch", batch, 1, 1000)
     agents = [agent for agent in agents if agent.name in enrolled or bundle is not None]
-    done, problem = operations.rollout(site, agents, _boards(site), _report, bundle=bundle, batch=batch)
-    print(f"{len(done)} of {len(agents)} done")
+    done, problem = operations.rollout(site, agents, _boards(site), _reporter(json), bundle=bundle, batch=batch)
+    answer({"done": done, "problem": problem}, [f"{len(done)} of {len(agents)} done"], json)
     if problem:
         print(f"syncline: rollout stopped: {problem}", file=sys.stderr)
         return EXIT_REFUSED
@@ -144,7 +158,13 @@ def rollout(
 
 @SITE.command
 def renew(
-    file: SiteToml, names: Names = None, /, *, every: Annotated[bool, Parameter(name="--all", negative="")] = False
+    file: SiteToml,
+    names: Names = None,
+    /,
+    *,
+    every: Annotated[bool, Parameter(name="--all", negative="")] = False,
+    json: Json = False,
+    seed: UnusedSeed = 0,
 ) -> int:
     """Renew the certificates that end within renew_days, each with a new key that its board makes.
 
@@ -162,13 +182,14 @@ def renew(
 
     site = _site(file)
     agents = operations.selected(site, names or ())
-    done, failed = operations.renew(site, agents, _boards(site), _report, every=every)
-    print(f"{len(done)} renewed" + (f", {failed[0]} failed" if failed else ""))
+    done, failed = operations.renew(site, agents, _boards(site), _reporter(json), every=every)
+    line = f"{len(done)} renewed" + (f", {failed[0]} failed" if failed else "")
+    answer({"done": done, "failed": failed}, [line], json)
     return EXIT_REFUSED if failed else EXIT_DONE
 
 
 @SITE.command
-def revoke(file: SiteToml, name: str, /) -> int:
+def revoke(file: SiteToml, name: str, /, *, json: Json = False, seed: UnusedSeed = 0) -> int:
     """Revoke an agent's certificates, and bring the new rules to the routers. `enrol NAME` takes it in again.
 
     Example: syncline site revoke site.toml cam07
@@ -182,13 +203,17 @@ def revoke(file: SiteToml, name: str, /) -> int:
 
     site = _site(file)
     failed: list[str] = []
-    for agent in operations.selected(site, [name]):
-        failed += operations.revoke(site, agent, _boards(site), _report)
+    revoked = operations.selected(site, [name])
+    for agent in revoked:
+        failed += operations.revoke(site, agent, _boards(site), _reporter(json))
+    answer({"done": [agent.name for agent in revoked], "failed": failed}, (), json)
     return EXIT_REFUSED if failed else EXIT_DONE
 
 
 @SITE.command
-def status(file: SiteToml, names: Names = None, /, *, offline: Flag = False, json: Json = False) -> int:
+def status(
+    file: SiteToml, names: Names = None, /, *, offline: Flag = False, json: Json = False, seed: UnusedSeed = 0
+) -> int:
     """Show every agent: certificate, ready or not, and what it says of itself. Exit status 3 if any is not ready.
 
     Example: syncline site status site.toml
@@ -233,7 +258,7 @@ def status(file: SiteToml, names: Names = None, /, *, offline: Flag = False, jso
 
 
 @SITE.command
-def monitoring(file: Path, /, *, out: Path) -> int:
+def monitoring(file: Path, /, *, out: Path, json: Json = False, seed: UnusedSeed = 0) -> int:
     """Write a Prometheus configuration with a target for each agent, the alert rules, and the Grafana dashboard.
 
     Example: syncline site monitoring site.toml --out monitoring
@@ -247,9 +272,8 @@ def monitoring(file: Path, /, *, out: Path) -> int:
     """
     from deploy.site.boards.site_file import write_monitoring
 
-    for line in write_monitoring(_site(file), out):
-        print(line)
-    return EXIT_DONE
+    written = write_monitoring(_site(file), out)
+    return answer({"written": written}, written, json)
 
 
 for _command in (image, request, accept, restore, update, ready):
@@ -268,5 +292,6 @@ def _boards(site: Site, stick: Path | None = None) -> Boards:
     return lambda agent: board_of(site, agent, stick)
 
 
-def _report(line: str) -> None:
-    print(line, flush=True)
+def _reporter(json: bool) -> Callable[[str], None]:
+    """Prints what is done, as it is done; beside a result as JSON on stderr."""
+    return partial(print, file=sys.stderr if json else sys.stdout, flush=True)

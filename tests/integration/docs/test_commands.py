@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import re
 import shlex
@@ -55,13 +56,13 @@ def test_the_documentation_names_commands() -> None:
 
 
 def test_commands_print_json_and_accept_a_seed() -> None:
-    """As docs/reference/commands.md says of all but the agents, also of those that draw nothing at random."""
-    others = [name for name, place, _ in COMMANDS if not place.startswith(("agents.run", "agents.router", "site.site"))]
+    """As docs/reference/commands.md says, also those that draw nothing at random."""
+    groups = {name: re.findall(r"^│ ([a-z]+) ", help_of(name), re.MULTILINE) for name in ("keys", "site")}
+    every = [(name,) for name, _, _ in COMMANDS if name not in groups]
+    every += [(name, part) for name, parts in groups.items() for part in parts]
+    assert len(every) > 40
     for option in ("--json", "--seed", "Example: "):
-        assert [name for name in others if option not in help_of(name) and name != "keys"] == []
-    parts = re.findall(r"^│ ([a-z]+) ", help_of("keys"), re.MULTILINE)
-    assert len(parts) >= 3
-    assert [part for part in parts if "--seed" not in help_of("keys", part)] == []
+        assert [words for words in every if option not in help_of(*words)] == []
 
 
 @pytest.mark.parametrize("name", sorted(NAMES))
@@ -172,3 +173,27 @@ def test_the_overview_lists_every_command() -> None:
     )
     assert all(re.search(rf"^[│ ]*{name}\b", result.stdout, re.MULTILINE) for name in NAMES)
     assert app is not None
+
+
+def test_an_agent_prints_its_statuses_or_its_configuration_as_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "cam.toml"
+    config.write_text('id = "cam0"\nsite = "a"\ndriver = "simulated"\n[simulated]\nseed = 3\n', encoding="utf-8")
+    assert run(["camera", str(config), "--print-config", "--json", "--seed", "9"]) == 0
+    assert json.loads(capsys.readouterr().out)["simulated"]["seed"] == 9
+    command = [sys.executable, "-m", "deploy", "camera", str(config), "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as agent:
+        assert agent.stdout is not None
+        report = json.loads(agent.stdout.readline())
+        agent.terminate()
+        rest = agent.stdout.read().splitlines()
+    assert (report["role"], report["agent"], agent.returncode) == ("camera", "cam0", 0)
+    assert json.loads(rest[-1])["state"] == "stopping"
+
+
+def test_a_seed_is_of_a_simulated_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = tmp_path / "cam.toml"
+    config.write_text('id = "cam0"\nsite = "a"\ndriver = "video"\n[video]\nsource = "a.mp4"\n', encoding="utf-8")
+    assert run(["camera", str(config), "--print-config", "--seed", "9"]) == 2
+    assert "--seed is of a simulated world" in capsys.readouterr().err
