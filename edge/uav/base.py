@@ -80,8 +80,8 @@ class Estimate:
     [rad], y down; nan where unknown. std: of the centre, one coordinate [px].
     north, east, speed, course, std_m: on the ground [m, m/s, rad]; nan where no metric ground frame is available;
     course = atan2(east, north). ground_frame: which frame these are of; two may be metres apart.
-    basis: frame of reference, and the reason for it; None where a tracker has only one. particles: (n, 2) image pixels, for overlays. layers: further named
-    geometry in image pixels for overlays (road, regions, tracks), (n, 2) each.
+    basis: frame of reference, and the reason for it; None where a tracker has only one. particles: (n, 2) image pixels,
+    for overlays. layers: further named geometry in image pixels for overlays (road, regions, tracks), (n, 2) each.
     """
 
     time: float

@@ -130,7 +130,7 @@ def test_the_correction_of_a_ground_frame_is_not_that_of_the_next() -> None:
     assert np.hypot(found.north - CAR[0], found.east - CAR[1]) < 0.1
 
 
-@pytest.mark.parametrize("samples, least", [(30, 0.4), (1, 1.5)])
+@pytest.mark.parametrize(("samples", "least"), [(30, 0.4), (1, 1.5)])
 def test_an_unknown_clock_is_part_of_the_std(samples: int, least: float) -> None:
     """It was the tracker's own, 0.1 m, where a clock that was 0.25 s off put a car 2 m beside its place."""
     georeference = Georeference(LENS, BODY_FROM_DOWN_CAMERA, clock_std_s=0.3)
