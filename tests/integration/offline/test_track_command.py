@@ -314,6 +314,17 @@ def test_telemetry_on_another_clock_or_in_other_units_is_named(
     assert warning in printed
 
 
+def test_times_in_milliseconds_about_the_video_are_refused(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They lie on both sides of the video, none in it: the images were said to show no plane."""
+    lines = [f"{100 * (k - 30) + 50},1,0,0,0,0,0,-30" for k in range(60)]
+    (tmp_path / "t.csv").write_text("\n".join(["time,qw,qx,qy,qz,north,east,down", *lines]) + "\n")
+    extra = ["--rig", str(recording / "rig.toml"), "--telemetry", str(tmp_path / "t.csv"), "--fps", "10"]
+    assert run(["track", str(recording / "pictures"), "--target", TARGET, "--out", str(tmp_path / "out"), *extra]) == 2
+    assert "first frame, in seconds" in capsys.readouterr().err
+
+
 def test_the_subtitles_of_a_drone_are_said_to_have_no_attitude(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -417,6 +417,9 @@ def test_a_black_image_leaves_the_plain_image_as_the_basis(scene: Image) -> None
     black = tracker.handle_frame(np.zeros_like(images[0]), 1 / FPS)
     assert black.state is not TrackState.VISIBLE
     assert not tracker.motion.trusted
+    box = Box(float(truth[0, 0] - 17), float(truth[0, 1] - 11), 34.0, 22.0)
+    first = make_tracker("ground", SIZE).begin(images[0], 0.0, box)
+    assert first.reason == "the first image shows no motion"  # it was that too few corners move alike
 
 
 def test_a_pan_that_could_not_be_measured_is_not_the_targets_velocity(
