@@ -157,14 +157,14 @@ def check_clock(samples: Sequence[Telemetry], file: Path, start: float, end: flo
     """
     times = np.array([sample.time for sample in samples])
     shown = f"times {times[0]:.1f} to {times[-1]:.1f} s, but the video's are {start:.1f} to {end:.1f} s"
-    remedy = "give times on the video's clock, 0 = its first frame"
-    if times[0] > end + 1.0 or times[-1] < start - 1.0:
-        raise InputError(shown, file=file, remedy=remedy)
+    remedy = "give times on the video's clock, 0 = its first frame, in seconds"
     covered = np.clip(np.r_[start - 1.0, times, end + 1.0], start - 1.0, end + 1.0)
     empty = float(np.maximum(np.diff(covered) - 2.0, 0.0).sum())
+    if times[-1] < start - 1.0 or end - start - 1e-6 < empty < math.inf:
+        raise InputError(shown, file=file, remedy=remedy)
     if not 1.0 < empty < math.inf:
         return []
-    return [f"{file}: no sample for {empty:.1f} s of the video: {shown}; {remedy}, in seconds"]
+    return [f"{file}: no sample for {empty:.1f} s of the video: {shown}; {remedy}"]
 
 
 def positions_fit(

@@ -223,7 +223,8 @@ class AdaptiveTracker:
         if motion.trusted:
             reason = f"{100 * motion.share:.0f} % of the corners around move alike"
             return replace(estimate, basis=Basis.STABILISED, reason=reason)
-        return replace(estimate, basis=Basis.IMAGE, reason="too few corners around move alike")
+        reason = "too few corners around move alike" if self._frame else "the first image shows no motion"
+        return replace(estimate, basis=Basis.IMAGE, reason=reason)
 
 
 class WithoutBars:

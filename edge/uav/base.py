@@ -79,9 +79,9 @@ class Estimate:
     x, y: centre in image pixels, also outside the image; nan when lost. heading: atan2(dy, dx) in the image
     [rad], y down; nan where unknown. std: of the centre, one coordinate [px].
     north, east, speed, course, std_m: on the ground [m, m/s, rad]; nan where no metric ground frame is available;
-    course = atan2(east, north). basis: frame of reference, and the reason for it; None where a
-    tracker has only one. particles: (n, 2) image pixels, for overlays. layers: further named
-    geometry in image pixels for overlays (road, regions, tracks), (n, 2) each.
+    course = atan2(east, north). ground_frame: which frame these are of; two may be metres apart.
+    basis: frame of reference, and the reason for it; None where a tracker has only one. particles: (n, 2) image pixels,
+    for overlays. layers: further named geometry in image pixels for overlays (road, regions, tracks), (n, 2) each.
     """
 
     time: float
@@ -97,6 +97,7 @@ class Estimate:
     speed: float = float("nan")
     course: float = float("nan")
     std_m: float = float("nan")
+    ground_frame: int = 0
     basis: Basis | None = None
     reason: str = ""
     hypotheses: tuple[Hypothesis, ...] = ()

@@ -19,6 +19,8 @@ from protocols.geometry.types import Floats
 _TIME_CONSTANT_S = 0.5  # of the offset's mean: longer ones lag behind the drift, shorter ones keep the attitude's noise
 _DRIFT_M_S = 0.1
 """Std by which the ground frame drifts each second: by metres within half a minute. Of gaps of 8 s it made 0.5 m."""
+_LONGEST_GAP_S = 0.8  # between attitudes: interpolated in 0.8 s 0.27° rms off, as an autopilot's, in 1.5 s 0.73°
+_CRUISE_M_S = 10.0  # of a vehicle whose samples do not tell
 _MIN_COSINE = 0.6  # between the ray and straight down: for flatter rays a small tilt error is metres
 _ROLL_PITCH_STD_RAD = 0.005  # of an autopilot's roll and pitch
 _MIN_HEIGHT_M = 2.0  # of the camera: below, an error of the height in metres is as large as the height
@@ -49,15 +51,17 @@ def _ground_std(place: Floats, centre: Floats) -> float:
 class Georeference:
     """Corrects target positions to the vehicle's frame; fed with telemetry on the camera's clock.
 
-    lens, body_from_camera: the camera's intrinsics and mounting.
+    lens, body_from_camera: the camera's intrinsics and mounting. clock_std_s: of the telemetry's clock against the
+    camera's; 0 where it is known. Else nothing is corrected, and the std has what the clock's error means.
     offset: (2,) north, east [m] from the tracker's ground frame to the vehicle's, smoothed; None while unknown.
     """
 
-    def __init__(self, lens: Intrinsics, body_from_camera: Floats) -> None:
-        self._lens = lens
-        self._telemetry = TelemetryTrack(np.asarray(body_from_camera))
+    def __init__(self, lens: Intrinsics, body_from_camera: Floats, clock_std_s: float = 0.0) -> None:
+        self._lens, self._clock_std_s = lens, clock_std_s
+        self._telemetry = TelemetryTrack(np.asarray(body_from_camera), _LONGEST_GAP_S)
         self._centre: Floats | None = None
-        self._measured_s = -math.inf
+        self._frame: int | None = None
+        self._known_s = self._start_std = 0.0  # since when the ground frame drifts, and its std [m] by then
         self.offset: Floats | None = None
 
     def add(self, sample: Telemetry) -> None:
@@ -66,7 +70,7 @@ class Georeference:
 
     def reset(self) -> None:
         """Start over for another target, whose ground frame is new."""
-        self.offset = self._centre = None
+        self.offset = self._centre = self._frame = None
 
     def locate(self, x: float, y: float, time: float) -> Floats | None:
         """Ground position (2,) north, east [m] of the target at a pixel; None if not observable."""
@@ -83,18 +87,32 @@ class Georeference:
         """The estimate with its position in the vehicle's frame and the std of that, where its ground is metric."""
         if not (math.isfinite(estimate.north) and math.isfinite(estimate.east)):
             return estimate
-        measured = self.locate(estimate.x, estimate.y, time)
         place = np.array([estimate.north, estimate.east])
+        if estimate.ground_frame != self._frame:
+            self._frame, self.offset, self._known_s = estimate.ground_frame, None, time
+            self._start_std = self._std_of_start(estimate, time)
+        measured = None if self._clock_std_s else self.locate(estimate.x, estimate.y, time)
         if measured is not None:
             difference = measured - place
-            gain = 1.0 if self.offset is None else -math.expm1(-max(time - self._measured_s, 0.0) / _TIME_CONSTANT_S)
+            gain = 1.0 if self.offset is None else -math.expm1(-max(time - self._known_s, 0.0) / _TIME_CONSTANT_S)
             self.offset = difference if self.offset is None else self.offset + gain * (difference - self.offset)
-            self._measured_s = time
+            self._known_s, self._start_std = time, 0.0
         if self.offset is not None:
             place = place + self.offset
-        centre = self._telemetry.position_at(time)
+        centre = self._telemetry.position_at(self._telemetry.nearest_time(time) if self._centre is None else time)
         self._centre = centre = self._centre if centre is None else centre
-        drift = 0.0 if self.offset is None else _DRIFT_M_S * (time - self._measured_s)
+        drift = _DRIFT_M_S * (time - self._known_s)
         ground = 0.0 if centre is None else _ground_std(place, centre)
-        std_m = math.hypot(estimate.std_m, ground, drift)
+        std_m = math.hypot(estimate.std_m, ground, drift, self._start_std)
         return replace(estimate, north=float(place[0]), east=float(place[1]), std_m=std_m)
+
+    def _std_of_start(self, estimate: Estimate, time: float) -> float:
+        """Std [m], one coordinate, of a ground frame that begins at a time with the nearest sample."""
+        nearest = self._telemetry.nearest_time(time)
+        off = math.hypot(self._clock_std_s, time - nearest)
+        early, late = (self._telemetry.nearest_time(nearest + shift) for shift in (-off, off))
+        places = [self.locate(estimate.x, estimate.y, moment) for moment in (early, late)]
+        speed = _CRUISE_M_S
+        if late > early and places[0] is not None and places[1] is not None:
+            speed = float(np.hypot(*(places[1] - places[0]))) / (late - early)
+        return speed * off / math.sqrt(2.0)

@@ -193,8 +193,8 @@ def _watched(what: str, flight: _Flight, quiet: bool) -> Iterator[Callable[[int]
 def _samples(
     telemetry: Path, flight: _Flight, quiet: bool, needs_lens: bool
 ) -> tuple[tuple[Telemetry, ...], list[str], Georeference | None]:
-    """The telemetry's samples, warnings, and what corrects positions by them where they are surely on the video's
-    clock. Raises InputError."""
+    """The telemetry's samples, warnings, and what corrects positions by them, or says how uncertain they are.
+    Raises InputError."""
     from deploy.offline import track as tracking
     from deploy.offline.telemetry_files import (
         Footage,
@@ -204,6 +204,7 @@ def _samples(
         read_telemetry_log,
     )
     from edge.uav.georeference import Georeference
+    from edge.uav.timing.telemetry_track import PRIOR_STD_S
 
     recording, count, warnings, aligned = flight.recording, flight.frames, [], False
     own_clock = telemetry.suffix.lower() in (".tlog", ".mcap")
@@ -246,9 +247,9 @@ def _samples(
             samples, found = align_to_video(recorded, telemetry, footage)
         warnings += found
         aligned = True
-    if not aligned or flight.lens is None or flight.mounting is None:
+    if flight.lens is None or flight.mounting is None:
         return samples, warnings, None
-    return samples, warnings, Georeference(flight.lens, flight.mounting)
+    return samples, warnings, Georeference(flight.lens, flight.mounting, 0.0 if aligned else PRIOR_STD_S)
 
 
 def _summarise(

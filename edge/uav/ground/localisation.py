@@ -108,6 +108,8 @@ class CameraLocaliser:
         usable = lens is not None and body_from_camera is not None
         self.telemetry = TelemetryTrack(np.asarray(body_from_camera)) if usable else None
         self._kind = "image"
+        self.switches = 0
+        """How often the ground frame was changed."""
         self.target_height = 0.0
         """Height of the target's centre above the ground [ground units]."""
         self._raised: tuple[PlanePose | PlaneHomography, float, Floats] | None = None  # pose, height, target_matrix
@@ -244,6 +246,7 @@ class CameraLocaliser:
         change = inverse(frame.pose.matrix) @ self.matrix
         self._ego.change_frame(frame.pose, change)
         self._kind = frame.kind
+        self.switches += 1
         if self.telemetry is not None:
             self.telemetry.reset_visual_attitudes()
         return np.asarray(change)

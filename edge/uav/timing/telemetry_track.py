@@ -18,7 +18,8 @@ from protocols.geometry.types import Floats
 MAX_OFFSET_S = 0.6
 """Largest offset [s]: half a second, plus some delay of the samples themselves."""
 _STEP_S = 0.02  # between the offsets that are compared; their weighted mean is finer
-_PRIOR_STD_S = 0.3  # of the offset: half of MAX_OFFSET_S
+PRIOR_STD_S = 0.3
+"""Std of the offset [s] before anything is known of it: half of MAX_OFFSET_S."""
 _MAX_GAP_S = 2.5  # between two samples for interpolation
 _CONFIRMING_SAMPLES = 3  # one alone is an error, not a clock
 _FORGETTING_FACTOR = 0.995  # of the cost, per sample
@@ -29,9 +30,13 @@ _BUFFER = 400  # samples: 4 s at 100 Hz, above the longest gap and MAX_OFFSET_S 
 
 
 class TelemetryTrack:
-    """Telemetry samples in order, queried by camera time. Invalid samples are rejected and counted."""
+    """Telemetry samples in order, queried by camera time. Invalid samples are rejected and counted.
 
-    def __init__(self, body_from_camera: Floats) -> None:
+    longest_gap_s: between two samples for interpolation.
+    """
+
+    def __init__(self, body_from_camera: Floats, longest_gap_s: float = _MAX_GAP_S) -> None:
+        self._longest_gap_s = longest_gap_s
         self._camera_from_body = np.asarray(body_from_camera, dtype=np.float64).T
         self._times: deque[float] = deque(maxlen=_BUFFER)
         self._rotations: deque[Floats] = deque(maxlen=_BUFFER)
@@ -45,7 +50,7 @@ class TelemetryTrack:
         self._mean: Floats | None = None
         self._last_update = 0.0
         self.offset = 0.0
-        self.offset_std = _PRIOR_STD_S
+        self.offset_std = PRIOR_STD_S
         self._set_back = 0
         self.rejected = 0
 
@@ -107,6 +112,10 @@ class TelemetryTrack:
             return None
         return np.asarray(first + fraction * (second - first))
 
+    def nearest_time(self, time: float) -> float:
+        """The time within the samples' span that is nearest to a camera time; that time without samples."""
+        return min(max(time, self._times[0]), self._times[-1]) if self._times else time
+
     def nearest(self, time: float, within: float) -> tuple[Floats, Floats | None] | None:
         """Rotation and position interpolated at a camera time, or of the nearest sample; None if none is within [s]."""
         rotation = self.rotation_at(time, extrapolation=within)
@@ -141,7 +150,7 @@ class TelemetryTrack:
             return None
         index = min(max(bisect_left(times, telemetry_time) - 1, 0), len(times) - 2)
         gap = times[index + 1] - times[index]
-        if gap > _MAX_GAP_S:
+        if gap > self._longest_gap_s:
             return None
         return index, float((telemetry_time - times[index]) / gap)
 
@@ -175,7 +184,7 @@ class TelemetryTrack:
             return
         spread = self._cost
         noise = max(_NOISE_RAD, float(np.sqrt(spread.min() / (3.0 * self._weight_sum))))
-        score = -0.5 * spread / noise**2 - 0.5 * np.square(self._offsets / _PRIOR_STD_S)
+        score = -0.5 * spread / noise**2 - 0.5 * np.square(self._offsets / PRIOR_STD_S)
         weight = np.exp(score - score.max())
         weight /= weight.sum()
         self.offset = float(weight @ self._offsets)

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from deploy.cli import run
-from deploy.offline.track import corners_for_a_box, parse_target
+from deploy.offline.track import check_clock, corners_for_a_box, parse_target
 from deploy.simulation.flight import write_simulated_flight
 from edge.mavlink.dialect import mavlink
+from edge.uav.base import Telemetry
+from protocols.core.errors import InputError
 from protocols.core.jpeg import encode_jpeg
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
@@ -312,6 +314,13 @@ def test_telemetry_on_another_clock_or_in_other_units_is_named(
     printed = capsys.readouterr().out
     assert ("warning:" in printed) == bool(warning)
     assert warning in printed
+
+
+def test_times_in_milliseconds_about_the_video_are_refused() -> None:
+    """They lie on both sides of the video, none in it: the images were said to show no plane."""
+    samples = [Telemetry(time, np.eye(3)) for time in (-50.0, 50.0)]
+    with pytest.raises(InputError, match="but the video's are"):
+        check_clock(samples, Path("t.csv"), 0.0, 7.2)
 
 
 def test_the_subtitles_of_a_drone_are_said_to_have_no_attitude(
