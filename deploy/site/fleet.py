@@ -16,7 +16,7 @@ from typing import Any
 
 from deploy.agents.processes import kill_all, last_line, start_process
 from deploy.site.rig_folder import ROLES, Agent, RigFolder, client_bus, write_agent_configs
-from protocols.bus.base import Bus
+from protocols.bus.base import Bus, BusStopped
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, is_loopback
 from protocols.bus.transport.zenoh_bus import open_bus
@@ -218,7 +218,18 @@ class Fleet:
             config = client_bus(endpoint)
         if not all(is_loopback(one) for one in config.connect):
             self._report(f"waiting for the router at {', '.join(config.connect)}")
-        return open_bus(site, config, stop=stop.is_set, timeout_s=30.0)
+        ended: list[str] = []
+
+        def hopeless() -> bool:
+            ended.extend(name for name, router in self._processes.items() if router.poll() is not None)
+            return stop.is_set() or bool(ended)
+
+        try:
+            return open_bus(site, config, stop=hopeless, timeout_s=30.0)
+        except BusStopped:
+            if not ended:
+                raise
+            raise InputError(f"{ended[0]} ended: {last_line(self._log(ended[0]))}") from None
 
     def _prepare_folder(self) -> None:
         """Create the folder; refuse if a fleet is running in it, and stop processes orphaned by a killed one."""
