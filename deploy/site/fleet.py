@@ -218,18 +218,17 @@ class Fleet:
             config = client_bus(endpoint)
         if not all(is_loopback(one) for one in config.connect):
             self._report(f"waiting for the router at {', '.join(config.connect)}")
-        ended: list[str] = []
 
-        def hopeless() -> bool:
-            ended.extend(name for name, router in self._processes.items() if router.poll() is not None)
-            return stop.is_set() or bool(ended)
+        def ended() -> list[str]:
+            return [name for name, router in self._processes.items() if router.poll() is not None]
 
         try:
-            return open_bus(site, config, stop=hopeless, timeout_s=30.0)
+            return open_bus(site, config, stop=lambda: stop.is_set() or bool(ended()), timeout_s=30.0)
         except BusStopped:
-            if not ended:
+            if stop.is_set():
                 raise
-            raise InputError(f"{ended[0]} ended: {last_line(self._log(ended[0]))}") from None
+            name = ended()[0]
+            raise InputError(f"{name} ended: {last_line(self._log(name))}") from None
 
     def _prepare_folder(self) -> None:
         """Create the folder; refuse if a fleet is running in it, and stop processes orphaned by a killed one."""

@@ -227,9 +227,6 @@ def camera_details(state: ViewState, camera: CameraView, now: float) -> str:
     if info is not None:
         lens = "intrinsics known" if len(info.matrix) == 9 else "no intrinsics: timing only"
         lines.append(f"{info.width}×{info.height}, {info.fps:g} fps nominal, {html.escape(info.driver)}, {lens}")
-    if not camera.is_static:
-        seen = f"{state.guidance.target} in {camera.seen}"
-        lines.append(f"{camera.frames} frames, {seen}, {camera.lost} lost, {camera.restarts} restarts")
     if camera.refusals:
         lines.append(f"refused {camera.refusals} times so far")
     pose, found = camera.pose, camera.calibration
@@ -238,6 +235,8 @@ def camera_details(state: ViewState, camera: CameraView, now: float) -> str:
         std = max(found.position_std, default=math.nan)
         lines.append(f"at {x:.3f}, {y:.3f}, {z:.3f} ± {std:.2g} {_unit(state)}")
     if not camera.is_static:
+        seen = f"{state.guidance.target} in {camera.seen}"
+        lines.append(f"{camera.frames} frames, {seen}, {camera.lost} lost, {camera.restarts} restarts")
         covered = state.guidance.covered_cells(camera.name)
         rows = ("".join("■" if covered[row, column] else "□" for column in range(COLUMNS)) for row in range(ROWS))
         grid, share = "\n".join(rows), 100 * state.guidance.coverage(camera.name)

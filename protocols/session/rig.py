@@ -304,13 +304,10 @@ def _read_camera(table: _Table) -> RigCamera:
     theirs = re.fullmatch(r"cam_\d+", table.where) is not None
     if name != table.where and not theirs:
         raise table.fail("name", f"name = {name!r} differs from the table's key", "make them the same")
-    nested = next((key for key, value in table.values.items() if isinstance(value, dict) and "size" in value), None)
-    if nested is not None and "size" not in table.values:
-        where = f"{table.where}.{nested}"
-        remedy = f'a camera with a full stop in its name needs quotes: ["{where}"]'
-        raise InputError(
-            f"[{where}] is a table in a table", file=table.file, line=toml_line(table.text, where), remedy=remedy
-        )
+    for key, value in table.values.items():
+        if isinstance(value, dict) and "size" in value and "size" not in table.values:
+            inner = _Table(value, f"{table.where}.{key}", table.file, table.text)
+            raise inner.fail(None, "is a table in a table", f'a full stop in a name needs quotes: ["{inner.where}"]')
     size = table.numbers("size", 2, "[width, height]", MAX_IMAGE_SIDE)
     if size is None or not (size > 0).all() or not (size == size.round()).all():
         raise table.fail("size", "size is missing or not two whole numbers", "give size = [width, height] in pixels")
@@ -430,6 +427,8 @@ def _read_pose(table: _Table) -> tuple[Floats | None, Floats | None]:
     """Position (3,) and rotation (3, 3); a translation is turned into a position."""
     position = table.numbers("position", 3, "[x, y, z]")
     rodrigues = table.numbers("rotation", 3, "a Rodrigues vector, camera from world", MAX_TURN)
+    if rodrigues is not None and float(np.linalg.norm(rodrigues)) > 2.0 * np.pi:
+        raise table.fail("rotation", "rotation is more than a whole turn", "give a Rodrigues vector in radians")
     translation = table.numbers("translation", 3, "camera from world")
     rotation = None if rodrigues is None else so3.exp(rodrigues)
     if translation is None:

@@ -147,10 +147,10 @@ def _status(out: Path, json: bool) -> int:
 def _table(agents: dict[str, dict[str, object]]) -> None:
     from rich.console import Console
     from rich.markup import escape
-    from rich.table import Column, Table
+    from rich.table import Table
 
-    heads = ("agent", "role", "state", "restarts", "frames", "detections")
-    table = Table(*heads, Column("message", overflow="fold"))  # an address that is cut short is of no use
+    table = Table("agent", "role", "state", "restarts", "frames", "detections", "message")
+    table.columns[-1].overflow = "fold"  # an address that is cut short is of no use
     for name, seen in agents.items():
         counters = seen["counters"]
         assert isinstance(counters, dict)

@@ -238,6 +238,7 @@ def test_what_is_no_toml_is_reported(tmp_path: Path, text: str, line: int | None
         ("[0.1, 0, 0, 0, 0]", '"none"', 6, "distortions"),
         ("[0.1, 0, 0, 0, 0]", "[nan, 0, 0, 0, 0]", 6, "distortions"),
         ("[0.1, 0, 0, 0, 0]", "[0.1, 0, 0, 0, 0, 0, 0, 0.2]", 6, "first of these alone are another lens"),
+        ("fps = 30", "rotation = [90.0, 0, 0]", 4, "radians"),
         ('name = "cam0"', 'name = "other"', 2, "name"),
     ],
 )
