@@ -328,7 +328,7 @@ def save_refusal(
     from hub.report import build_report
 
     folder = Path(out)
-    remove_outputs(folder)
+    remove_files(folder / name for name in (CALIBRATION, TRAJECTORY))
     document = refusal_document(
         refusal.reason,
         refusal.cameras,
@@ -343,11 +343,6 @@ def save_refusal(
     report = build_report(refusal, session.rig, session.observations, command)
     write_together({folder / RESULT: result_text(document), folder / REPORT: report})
     return document
-
-
-def remove_outputs(out: Path) -> None:
-    """Remove calibration.toml and trajectory.csv of an earlier result. Raises InputError."""
-    remove_files(out / name for name in (CALIBRATION, TRAJECTORY))
 
 
 def triangulate(

@@ -90,8 +90,10 @@ def _detector(config: CameraConfig, lens: Intrinsics | None, fps: float) -> Dete
         )
     moving = config.moving
     if config.detector not in get_args(Kind):
-        from edge.detectors.plugins import load_detector
+        from edge.detectors.plugins import is_plugin, load_detector, unknown_detector
 
+        if not is_plugin(config.detector):
+            raise unknown_detector(config.detector, ("marker", *get_args(Kind)))
         return load_detector(config.detector, fps=fps, prefix=f"{config.id[:48]}-")
     if config.detector == "person":
         from edge.detectors.people.person import PersonDetector

@@ -20,6 +20,7 @@ from fnmatch import fnmatch
 from importlib.metadata import PackageNotFoundError, metadata, requires
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from protocols.core.errors import InputError, Refused
@@ -123,15 +124,23 @@ def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = ()
 
     extras: optional dependency groups of the project, such as ``oak``, or packages of other roles, such as scipy.
 
-    Raises InputError if wheels are not available, Refused if the role exceeds its size limit.
+    Raises InputError if wheels are not available, which leaves an earlier bundle as it is, Refused if the role exceeds
+    its size limit.
     """
-    folder = out / _WHEELS
-    _clean(out)
+    check_folder(out)
     needed = [*_requirements(role, target, extras)]
-    wheel = _own_wheel(folder)
-    _download([str(requirement) for requirement in needed], folder, target)
-    _download_missing_dependencies(folder, wheel, target)
-    _download(["pip>=24"], folder, target)
+    folder = out / _WHEELS
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=out, prefix=".wheels.") as place:
+        new = Path(place)
+        wheel = _own_wheel(new)
+        _download([str(requirement) for requirement in needed], new, target)
+        _download_missing_dependencies(new, wheel, target)
+        _download(["pip>=24"], new, target)
+        for file in folder.glob("*.whl"):
+            file.unlink()
+        for file in new.glob("*.whl"):
+            file.replace(folder / file.name)
     bundle = Bundle(role, target, out)
     pins = []
     for file in sorted(folder.glob("*.whl")):
@@ -153,14 +162,6 @@ def make_bundle(role: str, target: Target, out: Path, extras: Sequence[str] = ()
             f"{bundle.installed_mb:.0f} MB installed, a {role} may take {budget:.0f} MB: see the largest wheels"
         )
     return bundle
-
-
-def _clean(out: Path) -> None:
-    """Create the folder, and remove only the wheels of an earlier bundle."""
-    check_folder(out)
-    (out / _WHEELS).mkdir(parents=True, exist_ok=True)
-    for file in (out / _WHEELS).glob("*.whl"):
-        file.unlink()
 
 
 def _requirements(role: str, target: Target, extras: Iterable[str]) -> Iterable[Requirement]:
@@ -289,6 +290,9 @@ def _pip(arguments: Sequence[str]) -> None:
         env={**os.environ, "SYNCLINE_PURE": "1"},
     )
     if ended.returncode:
+        if "Retrying (Retry(" in ended.stderr:
+            remedy = "make the bundle where there is a network, and carry its folder over"
+            raise InputError("the package index cannot be reached", remedy=remedy)
         lines = [line for line in ended.stderr.splitlines() if line.startswith("ERROR")]
         what = lines[0].removeprefix("ERROR: ") if lines else f"pip ended with status {ended.returncode}"
         raise InputError(what[:300], remedy="check --platform, --python and the connection to the package index")

@@ -16,7 +16,7 @@ from typing import Any
 
 from deploy.agents.processes import kill_all, last_line, start_process
 from deploy.site.rig_folder import ROLES, Agent, RigFolder, client_bus, write_agent_configs
-from protocols.bus.base import Bus
+from protocols.bus.base import Bus, BusStopped
 from protocols.bus.router.zenoh_router import Router, free_endpoint
 from protocols.bus.settings import LOOPBACK_ROUTER, BusConfig, is_loopback
 from protocols.bus.transport.zenoh_bus import open_bus
@@ -218,7 +218,17 @@ class Fleet:
             config = client_bus(endpoint)
         if not all(is_loopback(one) for one in config.connect):
             self._report(f"waiting for the router at {', '.join(config.connect)}")
-        return open_bus(site, config, stop=stop.is_set, timeout_s=30.0)
+
+        def ended() -> list[str]:
+            return [name for name, router in self._processes.items() if router.poll() is not None]
+
+        try:
+            return open_bus(site, config, stop=lambda: stop.is_set() or bool(ended()), timeout_s=30.0)
+        except BusStopped:
+            if stop.is_set():
+                raise
+            name = ended()[0]
+            raise InputError(f"{name} ended: {last_line(self._log(name))}") from None
 
     def _prepare_folder(self) -> None:
         """Create the folder; refuse if a fleet is running in it, and stop processes orphaned by a killed one."""

@@ -140,12 +140,10 @@ def camera_table(state: ViewState, now: float) -> str:
 
 def _camera_row(state: ViewState, camera: CameraView, now: float) -> str:
     status = camera.state(now)
-    cells = [
-        f"{camera.fps(now):.1f}",
-        ago(camera.last_seen, now),
-        f"{100 * state.guidance.coverage(camera.name):.0f}\u2009%",
-        str(camera.lost),
-    ]
+    covered = f"{100 * state.guidance.coverage(camera.name):.0f}\u2009%"
+    cells = [f"{camera.fps(now):.1f}", ago(camera.last_seen, now), covered, str(camera.lost)]
+    if camera.is_static:
+        cells = [""] * len(cells)  # a calibration holds no frames
     title = html.escape(camera.reason or status, quote=True)
     name = f"<td title='{title}'>{SIGNS[status]} {html.escape(camera.name)}</td>"
     kind = " class='bad'" if status in ("refused", "degraded", "silent", "gone") else ""
@@ -181,6 +179,8 @@ def progress_text(camera: CameraView) -> str:
 
 def picture_tiles(state: ViewState, now: float, *, wanted: bool) -> str:
     """The newest picture of every camera, with the detections of its own frame. wanted: pictures are asked for."""
+    if any(camera.is_static for camera in state.cameras.values()):
+        return f"{_STYLE}<div class='sl'><p>A calibration holds no pictures: play its log to see them.</p></div>"
     tiles = "".join(_tile(camera, now, wanted=wanted) for camera in state.cameras.values())
     return f"{_STYLE}<div class='sl'><div class='tiles'>{tiles}</div></div>"
 
@@ -227,8 +227,6 @@ def camera_details(state: ViewState, camera: CameraView, now: float) -> str:
     if info is not None:
         lens = "intrinsics known" if len(info.matrix) == 9 else "no intrinsics: timing only"
         lines.append(f"{info.width}×{info.height}, {info.fps:g} fps nominal, {html.escape(info.driver)}, {lens}")
-    seen = f"{state.guidance.target} in {camera.seen}"
-    lines.append(f"{camera.frames} frames, {seen}, {camera.lost} lost, {camera.restarts} restarts")
     if camera.refusals:
         lines.append(f"refused {camera.refusals} times so far")
     pose, found = camera.pose, camera.calibration
@@ -236,10 +234,13 @@ def camera_details(state: ViewState, camera: CameraView, now: float) -> str:
         x, y, z = pose.position
         std = max(found.position_std, default=math.nan)
         lines.append(f"at {x:.3f}, {y:.3f}, {z:.3f} ± {std:.2g} {_unit(state)}")
-    covered = state.guidance.covered_cells(camera.name)
-    grid = "\n".join("".join("■" if covered[row, column] else "□" for column in range(COLUMNS)) for row in range(ROWS))
-    share = 100 * state.guidance.coverage(camera.name)
-    lines.append(f"{state.guidance.target} seen in {share:.0f} % of the image:<div class='grid'>{grid}</div>")
+    if not camera.is_static:
+        seen = f"{state.guidance.target} in {camera.seen}"
+        lines.append(f"{camera.frames} frames, {seen}, {camera.lost} lost, {camera.restarts} restarts")
+        covered = state.guidance.covered_cells(camera.name)
+        rows = ("".join("■" if covered[row, column] else "□" for column in range(COLUMNS)) for row in range(ROWS))
+        grid, share = "\n".join(rows), 100 * state.guidance.coverage(camera.name)
+        lines.append(f"{state.guidance.target} seen in {share:.0f} % of the image:<div class='grid'>{grid}</div>")
     return f"{_STYLE}<div class='sl'>{''.join(f'<p>{line}</p>' for line in lines)}</div>"
 
 

@@ -295,7 +295,7 @@ class ViewState:
     def _camera(self, name: str) -> CameraView:
         if name not in self.cameras:
             self.cameras[name] = CameraView(name, is_static=self._is_static)
-            self.cameras = {key: self.cameras[key] for key in sorted(self.cameras)}
+            self.cameras = {key: self.cameras[key] for key in sorted(self.cameras, key=_natural_order)}
         return self.cameras[name]
 
     def _uav(self, name: str) -> UavView:
@@ -394,6 +394,11 @@ class ViewState:
 
 def _word(message: pb.Calibration) -> str:
     return message.state or {"solved": "calibrated"}.get(message.status, message.status)
+
+
+def _natural_order(name: str) -> list[str | int]:
+    """What sorts cam2 before cam10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def _counted(cameras: int) -> str:

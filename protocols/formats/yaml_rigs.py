@@ -33,7 +33,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.calibration import CameraCalibration
-from protocols.session.rig import METRES_PER_UNIT
+from protocols.session.rig import METRES_PER_UNIT, opencv_distortions
 
 _MAX_CHAIN_ERROR = 1e-3  # m, rad: two paths through the cameras agree to rounding
 _MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M")
@@ -261,16 +261,11 @@ def _opencv_camera(values: Mapping[str, Any], text: str, file: Path) -> ForeignC
 def _with_distortion(
     size: list[Any], matrix: Floats, bent: Floats, fisheye: bool, file: Path, line: int | None
 ) -> Intrinsics:
-    """A lens with OpenCV's 0, 4, 5 or more coefficients; those of the rational model must be 0."""
-    least = 4 if fisheye else 5
-    if len(bent) > least and np.any(bent[least:]):
-        what = f"{len(bent)} distortion coefficients: the rational and the thin-prism model are not known here"
-        raise InputError(what, file=file, line=line, remedy="calibrate with 4 or 5 coefficients")
-    if len(bent) not in (0, 4, 5, 8, 12, 14):
-        raise InputError(f"{len(bent)} distortion coefficients", file=file, line=line, remedy="give 4 or 5")
-    padded = np.zeros(least)
-    padded[: min(len(bent), least)] = bent[:least]
-    return Intrinsics(int(size[0]), int(size[1]), matrix, padded, fisheye)
+    """A lens with OpenCV's distortion coefficients. Raises InputError."""
+    try:
+        return Intrinsics(int(size[0]), int(size[1]), matrix, opencv_distortions(bent, fisheye), fisheye)
+    except InputError as error:
+        raise InputError(error.what, file=file, line=line, remedy=error.remedy) from None
 
 
 def _opencv_text(camera: CameraCalibration, units: str) -> str:

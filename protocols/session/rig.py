@@ -42,6 +42,7 @@ _KEYS = {
     *("position_std", "rotation", "rotation_std", "translation", "body_from_camera", "up"),
 }
 _METADATA_KEYS = {"units", "clock", "reference", "distances", "wand", "up", "bodies"}
+_OPENCV_COUNTS = (4, 5, 8, 12, 14)  # of distortion coefficients, without those of a fisheye
 _LIKENESS = 0.8  # of difflib: unit for units is 0.89, and no key of a calibration.toml is above 0.78
 
 
@@ -303,6 +304,10 @@ def _read_camera(table: _Table) -> RigCamera:
     theirs = re.fullmatch(r"cam_\d+", table.where) is not None
     if name != table.where and not theirs:
         raise table.fail("name", f"name = {name!r} differs from the table's key", "make them the same")
+    for key, value in table.values.items():
+        if isinstance(value, dict) and "size" in value and "size" not in table.values:
+            inner = _Table(value, f"{table.where}.{key}", table.file, table.text)
+            raise inner.fail(None, "is a table in a table", f'a full stop in a name needs quotes: ["{inner.where}"]')
     size = table.numbers("size", 2, "[width, height]", MAX_IMAGE_SIDE)
     if size is None or not (size > 0).all() or not (size == size.round()).all():
         raise table.fail("size", "size is missing or not two whole numbers", "give size = [width, height] in pixels")
@@ -386,14 +391,11 @@ def _read_intrinsics(table: _Table, width: int, height: int) -> Intrinsics | Non
     fisheye = table.values.get("fisheye", False)
     if not isinstance(fisheye, bool):
         raise table.fail("fisheye", f"fisheye = {fisheye!r}", "give true or false")
-    if "distortions" in table.values and isinstance(table.values["distortions"], list):
-        given = len(table.values["distortions"])
-        if not fisheye and given == 4:  # OpenCV's shortest form: k3 = 0
-            padded = {**table.values, "distortions": [*table.values["distortions"], 0.0]}
-            table = _Table(padded, table.where, table.file, table.text)
-    distortions = table.numbers(
-        "distortions", 4 if fisheye else 5, "[k1, k2, k3, k4]" if fisheye else "[k1, k2, p1, p2, k3]", MAX_DISTORTION
-    )
+    given = table.values.get("distortions")
+    count, names = (4, "[k1, k2, k3, k4]") if fisheye else (5, "[k1, k2, p1, p2, k3]")
+    if not fisheye and isinstance(given, list) and len(given) in _OPENCV_COUNTS:
+        count = len(given)
+    distortions = table.numbers("distortions", count, names, MAX_DISTORTION)
     if matrix is None:
         return None
     if not (
@@ -403,14 +405,30 @@ def _read_intrinsics(table: _Table, width: int, height: int) -> Intrinsics | Non
         and matrix[1, 0] == 0
     ):
         raise table.fail("matrix", "matrix is not a camera matrix", "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    zeros = np.zeros(4 if fisheye else 5)
-    return Intrinsics(width, height, matrix, zeros if distortions is None else distortions, fisheye)
+    try:
+        distortions = opencv_distortions(np.zeros(4) if distortions is None else distortions, fisheye)
+    except InputError as error:
+        raise table.fail("distortions", error.what, error.remedy) from None
+    return Intrinsics(width, height, matrix, distortions, fisheye)
+
+
+def opencv_distortions(given: Floats, fisheye: bool) -> Floats:
+    """Coefficients (5,), of a fisheye (4,), from OpenCV's 0, 4, 5 or more. Raises InputError for another model."""
+    kept = 4 if fisheye else 5
+    if np.any(given[kept:]):
+        what = f"{len(given)} distortion coefficients: the rational and the thin-prism model are not known here"
+        raise InputError(what, remedy="calibrate with 4 or 5; the first of these alone are another lens")
+    if len(given) not in (0, *_OPENCV_COUNTS):
+        raise InputError(f"{len(given)} distortion coefficients", remedy="give 4 or 5")
+    return np.append(given[:kept], np.zeros(max(0, kept - len(given))))
 
 
 def _read_pose(table: _Table) -> tuple[Floats | None, Floats | None]:
     """Position (3,) and rotation (3, 3); a translation is turned into a position."""
     position = table.numbers("position", 3, "[x, y, z]")
     rodrigues = table.numbers("rotation", 3, "a Rodrigues vector, camera from world", MAX_TURN)
+    if rodrigues is not None and float(np.linalg.norm(rodrigues)) > 2.0 * np.pi:
+        raise table.fail("rotation", "rotation is more than a whole turn", "give a Rodrigues vector in radians")
     translation = table.numbers("translation", 3, "camera from world")
     rotation = None if rodrigues is None else so3.exp(rodrigues)
     if translation is None:

@@ -83,14 +83,13 @@ def quick(
     from deploy.agents.processes import stop_on_signals
     from deploy.agents.quick import QuickCalibration, QuickSettings, show_report
     from deploy.offline.outputs import report_refusal, report_result
-    from hub.api import CalibrationResult, remove_outputs
+    from hub.api import CalibrationResult
     from protocols.core.files import check_folder
     from protocols.session.rig import read_rig
     from protocols.session.session import Session
 
     cv2.setNumThreads(1)
     check_folder(out)
-    remove_outputs(out)
     devices = _simulated(seed) if simulated else _video_files(source) if source else _webcams(cameras)
     known = None if rig is None else read_rig(rig)
     if known is not None and known.cameras.keys().isdisjoint(devices):

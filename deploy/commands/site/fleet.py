@@ -150,6 +150,7 @@ def _table(agents: dict[str, dict[str, object]]) -> None:
     from rich.table import Table
 
     table = Table("agent", "role", "state", "restarts", "frames", "detections", "message")
+    table.columns[-1].overflow = "fold"  # an address that is cut short is of no use
     for name, seen in agents.items():
         counters = seen["counters"]
         assert isinstance(counters, dict)

@@ -165,10 +165,17 @@ def parse_board(values: Mapping[str, Any]) -> Board:
     dictionary = values.get("dictionary", "APRILTAG_36H11" if kind == "apriltag" else "4X4_50")
     if not isinstance(dictionary, str):
         raise InputError(f"dictionary = {dictionary!r} is not text", remedy='give dictionary = "4X4_50"')
-    ratio = _number(values, "ratio", 0.05, 1.0 if not tags else 1.0 + 1e-9)
+    ratio = _number(values, "ratio", 0.05, 1.0)
     square, tag = (_number(values, key, 1e-9, _LARGEST) for key in ("square_size", "tag_size"))
-    if squares is not None and tags and square is not None and tag is not None:
+    if squares is None and square is not None:
+        raise InputError(
+            f"square_size = {square:g} without squares", remedy="give tag_size, or the squares of their grid"
+        )
+    if squares is not None and square is not None and tag is not None:
         ratio = tag / square
+    if ratio is not None and ratio >= 1.0:
+        what = f"ratio = {ratio:g}" if tag is None else f"tag_size = {tag:g}"
+        raise InputError(f"{what} is a marker as large as its square", remedy="measure both on the print")
     prints = {name: values.get(name) for name in _PRINTS}
     for name, value in prints.items():
         if value is not None and not isinstance(value, bool):

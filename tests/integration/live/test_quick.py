@@ -126,4 +126,8 @@ def test_bad_use_is_reported_in_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rig.toml").write_text('[left]\nname = "left"\nsize = [640, 480]\n')
+    earlier = tmp_path / "quick-out" / "calibration.toml"
+    earlier.parent.mkdir()
+    earlier.write_text("[cam0]\n")
     assert expected_text in refusal(capsys, ["quick", *words])
+    assert earlier.exists(), "a run that did not begin costs no calibration"

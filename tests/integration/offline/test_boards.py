@@ -6,6 +6,7 @@ import json
 import shutil
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -274,9 +275,23 @@ def test_tags_of_two_pixels_a_bit_are_read_and_leave_the_corners_next_to_them_al
     assert errors.std() < 0.13
 
 
-def test_a_board_too_small_is_bad_input() -> None:
-    with pytest.raises(InputError, match="too small"):
-        parse_board({"board": "chessboard", "squares": "3x3"})
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"board": "chessboard", "squares": "3x3"}, "too small"),
+        ({"squares": "8x5", "ratio": 1.0}, "ratio = 1 is a marker as large as its square"),
+        ({"squares": "8x5", "square_size": 0.04, "tag_size": 0.05}, "tag_size = 0.05 is a marker as large"),
+        ({"board": "aruco", "square_size": 0.1}, "square_size = 0.1 without squares; give tag_size"),
+    ],
+)
+def test_what_is_no_board_is_bad_input(values: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        parse_board(values)
+
+
+def test_sizes_of_square_and_marker_give_their_ratio() -> None:
+    board = parse_board({"board": "charuco", "squares": "8x5", "square_size": 0.04, "tag_size": 0.02})
+    assert (board.ratio, board.size) == (0.5, 0.04)
 
 
 def test_a_chessboard_that_looks_the_same_upside_down_keeps_its_order_while_it_turns() -> None:

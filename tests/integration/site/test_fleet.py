@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ import pytest
 
 from deploy.cli import run
 from deploy.site.fleet import STATE, Fleet, is_running
+from tests.support.command_line import refusal
 
 HUB = 'id = "hub"\nsite = "mini"\nrig = "rig.toml"\ninterval_s = 1.0\n'
 RIG = '[{0}]\nname = "{0}"\nsize = [640, 480]\n'
@@ -72,6 +74,19 @@ def test_a_fleets_world_has_the_seed_that_is_given(tmp_path: Path, monkeypatch: 
         run(["fleet", "up", str(rig), "--simulated", "--seconds", "1", "--out", str(tmp_path / "out"), *given])
     assert seeds == [3, 9]
     assert run(["fleet", "up", str(rig), "--seed", "9"]) == 2
+
+
+def test_a_router_whose_address_is_taken_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = mini(tmp_path / "rig")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        endpoint = f'["tcp/127.0.0.1:{taken.getsockname()[1]}"]'
+        (rig / "router.toml").write_text(f'id = "r"\nsite = "mini"\n[bus]\nlisten = {endpoint}\n')
+        for name in ("cam0", "cam1", "hub", "recorder"):
+            with (rig / f"{name}.toml").open("a") as file:
+                file.write(f'[bus]\nmode = "client"\nconnect = {endpoint}\n')
+        said = refusal(capsys, ["fleet", "up", str(rig), "--out", str(tmp_path / "out"), "--json"])
+    assert "syncline: r ended: bus: " in said
+    assert "Address already in use" in said
 
 
 def test_the_next_fleet_stops_agents_of_a_killed_one(tmp_path: Path) -> None:

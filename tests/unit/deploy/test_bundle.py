@@ -10,6 +10,7 @@ import pytest
 from deploy.cli import run
 from deploy.site.bundle import BUDGET_MB, ROLE_PACKAGES, Target, _lock, _requirements, _script
 from protocols.core.errors import InputError
+from tests.support.command_line import refusal
 
 
 @pytest.mark.parametrize("role", sorted(ROLE_PACKAGES))
@@ -64,6 +65,21 @@ def test_the_script_refuses_another_machine(tmp_path: Path) -> None:
     assert ended.returncode == 1
     assert "this bundle is for riscv64" in ended.stderr
     assert not (tmp_path / "target").exists()
+
+
+def test_without_a_network_an_earlier_bundle_is_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wheel = tmp_path / "wheels" / "numpy-2.0-cp311-cp311-any.whl"
+    wheel.parent.mkdir()
+    wheel.touch()
+    monkeypatch.setattr("deploy.site.bundle._own_wheel", lambda folder: folder / "syncline.whl")
+    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:1/simple")
+    monkeypatch.setenv("PIP_RETRIES", "1")
+    assert "the package index cannot be reached; make the bundle where" in refusal(
+        capsys, ["bundle", "--out", str(tmp_path)]
+    )
+    assert [file for file in tmp_path.rglob("*") if file.is_file()] == [wheel]
 
 
 def test_bad_use(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

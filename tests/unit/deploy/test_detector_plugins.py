@@ -84,6 +84,15 @@ def test_calibrate_refuses_what_is_no_detector(
         )
 
 
+def test_a_camera_whose_file_names_no_detector_is_told_all_of_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cam0.toml").write_text('id = "cam0"\ndriver = "simulated"\ndetector = "ball"\n')
+    assert "'ball'; use one of marker, person, vehicle, or a network's" in refusal(
+        capsys, ["camera", str(tmp_path / "cam0.toml")]
+    )
+
+
 def test_what_a_network_detects_is_a_valid_message_and_matches_predictions(tmp_path: Path) -> None:
     from edge.detectors.base import Prediction
 

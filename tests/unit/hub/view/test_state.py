@@ -9,7 +9,7 @@ import pytest
 
 from hub.view.image_planes import pixel_of
 from hub.view.page import calibration_file, draw_detections
-from hub.view.panels import ago, camera_details, camera_table, overview
+from hub.view.panels import ago, camera_details, camera_table, overview, picture_tiles
 from hub.view.player import CalibrationRecording, LogRecording, Player
 from hub.view.scene_renderer import fit_viewpoint
 from hub.view.server import AccessControl, action_result, commands_for, is_local
@@ -46,6 +46,23 @@ def test_frame_rate_and_lost_frames_follow_from_the_frames() -> None:
     assert camera.frames == 51, "a duplicate frame counts once"
     state.handle(observation("cam0", 3, boot_id="boot-2"), now + 0.6)
     assert (camera.restarts, camera.lost) == (1, 9), "another boot id may start at any sequence number"
+
+
+def test_cameras_are_in_the_order_of_their_numbers() -> None:
+    state = ViewState()
+    for name in ("cam10", "cam2", "Tür", "7", "cam1"):
+        filming(state, name, 0.1)
+    assert list(state.cameras) == ["7", "Tür", "cam1", "cam2", "cam10"]
+
+
+def test_of_a_calibration_nothing_is_said_of_frames_and_pictures() -> None:
+    state = ViewState(is_static=True, is_live=False)
+    state.handle(calibration(), 0.0)
+    table, tiles = camera_table(state, 0.0), picture_tiles(state, 0.0, wanted=True)
+    details = camera_details(state, state.cameras["cam0"], 0.0)
+    assert "data-state='calibrated'" in table
+    assert not any(word in table + tiles + details for word in ("never", "0.0</td>", "picture yet", "0 frames", "0 %"))
+    assert "play its log" in tiles
 
 
 def test_a_camera_is_calibrated_refused_silent_or_gone() -> None:

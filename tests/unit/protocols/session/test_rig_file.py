@@ -73,6 +73,12 @@ def test_fisheye_is_true_or_false_and_nothing_else(tmp_path: Path, bad: str) -> 
     assert_reported(tmp_path, text, 7, "fisheye")
 
 
+def test_zeros_of_a_richer_model_are_no_distortion(tmp_path: Path) -> None:
+    lens = read(tmp_path, CAM0.replace("[0.1, 0, 0, 0, 0]", f"{[0.1, *[0] * 13]}")).cameras["cam0"].intrinsics
+    assert lens is not None
+    np.testing.assert_array_equal(lens.distortions, [0.1, 0, 0, 0, 0])
+
+
 def test_distortions_may_be_absent(tmp_path: Path) -> None:
     lens = read(tmp_path, CAM0.replace("distortions = [0.1, 0, 0, 0, 0]\n", "")).cameras["cam0"].intrinsics
     assert lens is not None
@@ -231,6 +237,8 @@ def test_what_is_no_toml_is_reported(tmp_path: Path, text: str, line: int | None
         ("[0.1, 0, 0, 0, 0]", "[0.1]", 6, "distortions"),
         ("[0.1, 0, 0, 0, 0]", '"none"', 6, "distortions"),
         ("[0.1, 0, 0, 0, 0]", "[nan, 0, 0, 0, 0]", 6, "distortions"),
+        ("[0.1, 0, 0, 0, 0]", "[0.1, 0, 0, 0, 0, 0, 0, 0.2]", 6, "first of these alone are another lens"),
+        ("fps = 30", "rotation = [90.0, 0, 0]", 4, "radians"),
         ('name = "cam0"', 'name = "other"', 2, "name"),
     ],
 )
@@ -294,6 +302,10 @@ def test_a_value_outside_a_table_is_reported(tmp_path: Path) -> None:
 
 def test_an_array_of_tables_is_reported(tmp_path: Path) -> None:
     assert_reported(tmp_path, CAM0.replace("[cam0]", "[[cam0]]"), None, "cam0")
+
+
+def test_a_name_with_a_full_stop_needs_quotes(tmp_path: Path) -> None:
+    assert_reported(tmp_path, "[cam.0]\nsize = [1280, 720]\n", 1, 'needs quotes: ["cam.0"]')
 
 
 def test_a_quoted_name_keeps_its_line(tmp_path: Path) -> None:
