@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import sys
@@ -111,7 +112,10 @@ def status_lines(
 
     def show(status: Any) -> None:
         seen(status)
-        print(json.dumps(report(), allow_nan=False), file=out, flush=True)
+        try:
+            print(json.dumps(report(), allow_nan=False), file=out, flush=True)
+        except BrokenPipeError:  # nobody reads any more, which does not end an agent
+            os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
 
     with redirect_stdout(sys.stderr):
         yield show

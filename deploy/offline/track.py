@@ -160,7 +160,8 @@ def check_clock(samples: Sequence[Telemetry], file: Path, start: float, end: flo
     remedy = "give times on the video's clock, 0 = its first frame, in seconds"
     covered = np.clip(np.r_[start - 1.0, times, end + 1.0], start - 1.0, end + 1.0)
     empty = float(np.maximum(np.diff(covered) - 2.0, 0.0).sum())
-    if times[-1] < start - 1.0 or end - start - 1e-6 < empty < math.inf:
+    outside = times[-1] < start - 1.0 or times[0] > end + 1.0
+    if outside or (end > start and end - start - 1e-6 < empty < math.inf):
         raise InputError(shown, file=file, remedy=remedy)
     if not 1.0 < empty < math.inf:
         return []

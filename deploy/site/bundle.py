@@ -290,7 +290,7 @@ def _pip(arguments: Sequence[str]) -> None:
         env={**os.environ, "SYNCLINE_PURE": "1"},
     )
     if ended.returncode:
-        if "Retrying (Retry(" in ended.stderr:
+        if "Retry(total=0" in ended.stderr:
             remedy = "make the bundle where there is a network, and carry its folder over"
             raise InputError("the package index cannot be reached", remedy=remedy)
         lines = [line for line in ended.stderr.splitlines() if line.startswith("ERROR")]

@@ -223,12 +223,16 @@ class Fleet:
             return [name for name, router in self._processes.items() if router.poll() is not None]
 
         try:
-            return open_bus(site, config, stop=lambda: stop.is_set() or bool(ended()), timeout_s=30.0)
+            bus = open_bus(site, config, stop=lambda: stop.is_set() or bool(ended()), timeout_s=30.0)
         except BusStopped:
             if stop.is_set():
                 raise
-            name = ended()[0]
-            raise InputError(f"{name} ended: {last_line(self._log(name))}") from None
+        else:
+            if not ended():
+                return bus
+            bus.close()  # of another router, which has the port of one that ended
+        name = ended()[0]
+        raise InputError(f"{name} ended: {last_line(self._log(name))}")
 
     def _prepare_folder(self) -> None:
         """Create the folder; refuse if a fleet is running in it, and stop processes orphaned by a killed one."""

@@ -54,6 +54,7 @@ class AdaptiveTracker:
         self._ground: GroundTracker | None = GroundTracker(size, lens, body_from_camera, fps, seed)
         self._appearance = AppearanceTracker(size, fps)
         self._samples: list[Telemetry] = []
+        self._restarts = 0  # of the ground, each in a frame of its own
         self._trust = 0.0  # -1: contradicted, 1: held
         self._retry_s, self._retry_at = _RETRY_S, np.inf
         self._frame = 0
@@ -182,6 +183,7 @@ class AdaptiveTracker:
         except InputError:
             return
         self._ground, self._trust, self._steep = ground, 0.0, False
+        self._restarts += 1
 
     def _compare(self, ground: Estimate, seen: Estimate, time: float) -> None:
         """Evidence for and against the ground, from a frame in which the appearance is certain of the target."""
@@ -216,7 +218,8 @@ class AdaptiveTracker:
     def _on_ground(self, estimate: Estimate) -> Estimate:
         metric = bool(np.isfinite(estimate.north)) or (self._ground is not None and self._ground.metric)
         reason = _ATTITUDE if self._steep else "the target moves on one plane"
-        return replace(estimate, basis=Basis.GROUND if metric else Basis.PLANE, reason=reason)
+        frame = self._restarts, *estimate.ground_frame[-1:]
+        return replace(estimate, basis=Basis.GROUND if metric else Basis.PLANE, reason=reason, ground_frame=frame)
 
     def _on_image(self, estimate: Estimate) -> Estimate:
         motion = self._appearance.motion

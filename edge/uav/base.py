@@ -97,7 +97,7 @@ class Estimate:
     speed: float = float("nan")
     course: float = float("nan")
     std_m: float = float("nan")
-    ground_frame: int = 0
+    ground_frame: tuple[int, ...] = ()
     basis: Basis | None = None
     reason: str = ""
     hypotheses: tuple[Hypothesis, ...] = ()

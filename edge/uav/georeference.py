@@ -60,7 +60,7 @@ class Georeference:
         self._lens, self._clock_std_s = lens, clock_std_s
         self._telemetry = TelemetryTrack(np.asarray(body_from_camera), _LONGEST_GAP_S)
         self._centre: Floats | None = None
-        self._frame: int | None = None
+        self._frame: tuple[int, ...] | None = None
         self._known_s = self._start_std = 0.0  # since when the ground frame drifts, and its std [m] by then
         self.offset: Floats | None = None
 

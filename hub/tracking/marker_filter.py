@@ -261,6 +261,8 @@ def _filtered(state: MarkerState, row: MarkerRow, elapsed: float, factor: float,
             nuu, nuv, nvv = nuu + mu * mu, nuv + mu * mv, nvv + mv * mv
             suu, suv, svv = uu + nuu, uv + nuv, vv + nvv
             determinant = suu * svv - suv * suv
+            if not determinant > 0.0:
+                return None
             iuu, iuv, ivv = svv / determinant, -suv / determinant, suu / determinant
             su, sv = iuu * u + iuv * v, iuv * u + ivv * v
             distance = u * su + v * sv

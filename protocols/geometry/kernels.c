@@ -1293,6 +1293,7 @@ double filter_row(double dt, const double *psd, const double *mean, const double
             double nuu = factor * row[2] + mu * mu, nuv = factor * row[3] + mu * mv, nvv = factor * row[4] + mv * mv;
             double suu = su[0][0] + nuu, suv = su[0][1] + nuv, svv = su[1][1] + nvv;
             double determinant = suu * svv - suv * suv;
+            if (!(determinant > 0.0)) return 0.0;
             double iuu = svv / determinant, iuv = -suv / determinant, ivv = suu / determinant;
             double ru = iuu * u + iuv * v, rv = iuv * u + ivv * v;
             distance = u * ru + v * rv;

@@ -171,17 +171,18 @@ def parse_board(values: Mapping[str, Any]) -> Board:
         raise InputError(
             f"square_size = {square:g} without squares", remedy="give tag_size, or the squares of their grid"
         )
-    if squares is not None and square is not None and tag is not None:
+    marked = squares is not None and kind != "chessboard"
+    if marked and square is not None and tag is not None:
         ratio = tag / square
-    if ratio is not None and ratio >= 1.0:
+    if marked and ratio is not None and not 0.05 <= ratio < 1.0:
         what = f"ratio = {ratio:g}" if tag is None else f"tag_size = {tag:g}"
-        raise InputError(f"{what} is a marker as large as its square", remedy="measure both on the print")
+        raise InputError(f"{what} is no marker within its square", remedy="measure both on the print, in one unit")
     prints = {name: values.get(name) for name in _PRINTS}
     for name, value in prints.items():
         if value is not None and not isinstance(value, bool):
             raise InputError(f"{name} = {value!r} is not true or false", remedy=f"give {name} = true or false")
     board = Board(kind, squares, dictionary, ratio or 0.75, square if squares is not None else tag, **prints)
-    if squares is not None and square is None and tag is not None and tags:
+    if marked and square is None and tag is not None:
         board = replace(board, size=tag / board.ratio)
     check_board(board)
     return board

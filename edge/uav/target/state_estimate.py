@@ -57,7 +57,7 @@ def estimate_target(
         height=float(size[1]),
         heading=float(np.arctan2(direction[1], direction[0])) if heading_known else float("nan"),
         std=std,
-        ground_frame=localiser.switches,
+        ground_frame=(localiser.switches,),
         hypotheses=_hypotheses(clusters, localiser),
         particles=pixels[9:],
     )

@@ -114,14 +114,12 @@ def test_what_is_waited_for_of_people_is_said_of_people(traffic: Traffic) -> Non
     assert "motion shared" not in status.message
 
 
-@pytest.mark.parametrize(("seed", "cameras", "heights"), [(4, 4, None), (9, 3, (1.75, 1.76))])
-def test_lags_by_people_are_right_within_their_stds(seed: int, cameras: int, heights: tuple[float, ...] | None) -> None:
+def test_lags_by_people_are_right_within_their_stds() -> None:
     """By feet too they were 25 ms off at stds of 9. With two people of one height it takes feet to begin."""
-    scene = scenes.get_people_scene(seed, cameras, 4 if heights is None else len(heights))
-    if heights is not None:
-        people = (replace(one, height=height) for one, height in zip(scene.people, heights, strict=True))
-        scene = replace(scene, people=tuple(people))
-    hub, traffic, due = LiveHub(), film(scene, 60.0, seed), 30.0
+    scene = scenes.get_people_scene(9, 3, 2)
+    people = (replace(one, height=height) for one, height in zip(scene.people, (1.75, 1.76), strict=True))
+    scene = replace(scene, people=tuple(people))
+    hub, traffic, due = LiveHub(), film(scene, 60.0, 9), 30.0
     for info in traffic.infos:
         hub.handle(info)
     for at, message in traffic.arrivals:
@@ -129,11 +127,11 @@ def test_lags_by_people_are_right_within_their_stds(seed: int, cameras: int, hei
         if at > due:
             hub.tick(at)
             due = at + 6.0
-        if hub.calibration is not None and len(hub.calibration.cameras) == cameras:
+        if hub.calibration is not None and len(hub.calibration.cameras) == 3:
             break
     found = hub.calibration
     assert found is not None, hub.refusal
-    assert len(found.cameras) == cameras
+    assert len(found.cameras) == 3
     for name, camera in found.cameras.items():
         true = scene.true_time_map(name, found.reference)
         error = camera.lag - (true.clock_rate - 1.0) * camera.lag_time - true.time_offset
@@ -195,7 +193,7 @@ def test_people_who_walk_from_one_view_to_the_next_contradict_no_calibration(kno
     """A restarted hub threw a right calibration away, and a given one was `degraded`: their clocks shared no time."""
     traffic, (rig, cameras) = film(SCENE, 80.0, 21), read_calibration(known)
     delays = {message.camera: 1e9 + at - message.device_time_ns / NANOSECONDS for at, message in traffic.arrivals}
-    hub = LiveHub(known=KnownCalibration(rig, cameras) if given else None)
+    hub = LiveHub(LiveSettings(track=False), known=KnownCalibration(rig, cameras) if given else None)
     hub.reload(
         Calibration(cameras, traffic.reference, "metric", "m", "joint", "1"), dict.fromkeys(cameras, "boot0"), delays
     )

@@ -279,8 +279,9 @@ def test_tags_of_two_pixels_a_bit_are_read_and_leave_the_corners_next_to_them_al
     ("values", "words"),
     [
         ({"board": "chessboard", "squares": "3x3"}, "too small"),
-        ({"squares": "8x5", "ratio": 1.0}, "ratio = 1 is a marker as large as its square"),
-        ({"squares": "8x5", "square_size": 0.04, "tag_size": 0.05}, "tag_size = 0.05 is a marker as large"),
+        ({"squares": "8x5", "ratio": 1.0}, "ratio = 1 is no marker within its square"),
+        ({"squares": "8x5", "square_size": 0.04, "tag_size": 0.05}, "tag_size = 0.05 is no marker within"),
+        ({"squares": "8x5", "square_size": 20.0, "tag_size": 0.015}, "tag_size = 0.015 is no marker within"),
         ({"board": "aruco", "square_size": 0.1}, "square_size = 0.1 without squares; give tag_size"),
     ],
 )
@@ -292,6 +293,8 @@ def test_what_is_no_board_is_bad_input(values: dict[str, Any], words: str) -> No
 def test_sizes_of_square_and_marker_give_their_ratio() -> None:
     board = parse_board({"board": "charuco", "squares": "8x5", "square_size": 0.04, "tag_size": 0.02})
     assert (board.ratio, board.size) == (0.5, 0.04)
+    alone = parse_board({"board": "charuco", "squares": "8x5", "tag_size": 0.03})
+    assert (alone.ratio, alone.size) == (0.75, pytest.approx(0.04))
 
 
 def test_a_chessboard_that_looks_the_same_upside_down_keeps_its_order_while_it_turns() -> None:

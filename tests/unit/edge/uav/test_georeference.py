@@ -125,7 +125,7 @@ def test_the_correction_of_a_ground_frame_is_not_that_of_the_next() -> None:
     simulate_flight(1.0, np.array([6.0, -3.0]), georeference)
     attitude, centre = attitude_at_pitch(0.1), np.array([2.0, -5.0, -60.0])
     georeference.add(Telemetry(1.0, attitude, centre))
-    changed = replace(estimate_at(*pixel(attitude, centre), *CAR[:2]), ground_frame=1)
+    changed = replace(estimate_at(*pixel(attitude, centre), *CAR[:2]), ground_frame=(1,))
     found = georeference.corrected(changed, 1.0)
     assert np.hypot(found.north - CAR[0], found.east - CAR[1]) < 0.1
 

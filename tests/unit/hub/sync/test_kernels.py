@@ -379,20 +379,20 @@ def test_observations_match_the_same_layouts(both: Both) -> None:
     assert not alone.any(), "without kernels they are matched one by one"
 
 
-@pytest.mark.parametrize("seen_by", [1, 3])
-def test_marker_filter_and_smoother(both: Both, seen_by: int) -> None:
-    """Fast and slow, with time maps of 2 ms, outliers, and silences after which depths are lost."""
-    rng = np.random.default_rng(seen_by)
+@pytest.mark.parametrize(("seen_by", "speed", "noise"), [(3, 2.0, 2e-3), (1, 2.0, 2e-3), (1, 5.0, 2e-2)])
+def test_marker_filter_and_smoother(both: Both, seen_by: int, speed: float, noise: float) -> None:
+    """With time maps of 2 ms, outliers, and one camera alone that loses depths (three times in the last case)."""
+    rng = np.random.default_rng(1)
     rig = [replace(camera, time_std=2e-3) for camera in cameras(3, 5)]
-    times = np.sort(rng.uniform(0.0, 6.0, 400))
+    times = np.sort(rng.uniform(0.0, 12.0, 700))
     times = times[(times < 3.0) | (times > 4.5)]
     rows = []
     for number, time in enumerate(times.tolist()):
         camera = rig[number % (3 if time < 1.5 else seen_by)]
-        place = np.array([np.sin(2.0 * time), 0.3 * np.cos(3.0 * time), 0.2 * time])
+        place = np.array([np.sin(speed * time), 0.3 * np.cos(1.5 * speed * time), 0.2 * time])
         row = row_of(camera, time, place, number)
-        u, v = np.array(row.point) + rng.normal(0.0, 2e-3, 2) + (rng.uniform() < 0.05)
-        rows.append(replace(row, point=(float(u), float(v)), noise=(4e-6, 1e-7, 4e-6)))
+        u, v = np.array(row.point) + rng.normal(0.0, noise, 2) + (noise < 0.01 and number % 20 == 0)
+        rows.append(replace(row, point=(float(u), float(v)), noise=(noise**2, 0.02 * noise**2, noise**2)))
 
     def filtered() -> Floats:
         state, out, smoothed = MarkerState(), list[Floats](), list[MarkerState]()
@@ -406,4 +406,4 @@ def test_marker_filter_and_smoother(both: Both, seen_by: int) -> None:
 
     compiled, plain = both(filtered)
     assert len(plain) > 300 * 250
-    np.testing.assert_allclose(compiled, plain, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(compiled, plain, rtol=1e-5, atol=1e-7)
