@@ -264,6 +264,25 @@ def test_a_place_that_moves_under_test_looks_like_others_that_move(scene: Image)
     assert stands - unknown < -1.0
 
 
+def test_a_place_of_half_the_predicted_size_is_less_probable(scene: Image) -> None:
+    """Under test a look-alike shrank from frame to frame: the foot of a tree, 7 px wide, became a boat of 14 px."""
+    place = np.array([120.0, 120.0])
+    image, box = painted(scene, place), OrientedBox(*place, *map(float, TARGET))
+    memory = TemplateMemory()
+    memory.add(image, box)
+    answer = Response(0.0, 0.0, 0.0, 1.0)
+    search = Redetection(SIZE, memory, memory, lambda image, box: (box, answer), ColourModel(image, box))
+    evidence = []
+    for factor in (1.0, 1.25, 2.0):
+        expected = replace(prediction(120.0), box=box.sized(factor * box.sides))
+        candidate = Candidate(box, 0.0, expected.motion, hits=1)
+        search._test(image, candidate, expected, 1.0 / FPS)
+        evidence.append(candidate.evidence)
+    same, larger, twice = evidence
+    assert 0.0 < same - larger < 0.5
+    assert same - twice > 0.8
+
+
 @pytest.mark.parametrize(("offset", "goes"), [(15.0, True), (60.0, False)])
 def test_a_box_that_stands_goes_to_what_moves_no_further_than_it_can_have_slipped(
     scene: Image, monkeypatch: pytest.MonkeyPatch, offset: float, goes: bool
@@ -546,3 +565,13 @@ def test_one_of_its_kind_that_passes_before_the_target_does_not_take_it_along(sc
         if found.state is TrackState.VISIBLE:
             assert abs(found.x - 100.0 - k) < 18.0, k
     assert found.state is TrackState.VISIBLE
+
+
+def test_a_ground_that_begins_again_has_a_frame_of_its_own(scene: Image) -> None:
+    """A correction of metres between two frames was kept where the second one had the first one's number."""
+    place, tracker = np.array([160.0, 120.0]), AdaptiveTracker(SIZE)
+    image = painted(scene, place)
+    first = tracker.begin(image, 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
+    before = tracker._on_ground(first).ground_frame
+    tracker._restart_ground(image, 0.1, first)
+    assert tracker._on_ground(first).ground_frame != before
