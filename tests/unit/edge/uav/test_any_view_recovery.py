@@ -246,13 +246,17 @@ def test_a_place_that_another_tracker_found_is_as_probable_as_it_is_near(scene: 
     assert near > 0.0 > far
 
 
-def test_a_place_that_moves_under_test_looks_like_others_that_move(scene: Image) -> None:
+def remembered(scene: Image) -> tuple[Image, OrientedBox, Redetection]:
+    """An image of the target, its box, and a search that knows it by this view."""
     place = np.array([120.0, 120.0])
     image, box = painted(scene, place), OrientedBox(*place, *map(float, TARGET))
-    memory = TemplateMemory()
+    memory, answer = TemplateMemory(), Response(0.0, 0.0, 0.0, 1.0)
     memory.add(image, box)
-    answer = Response(0.0, 0.0, 0.0, 1.0)
-    search = Redetection(SIZE, memory, memory, lambda image, box: (box, answer), ColourModel(image, box))
+    return image, box, Redetection(SIZE, memory, memory, lambda image, box: (box, answer), ColourModel(image, box))
+
+
+def test_a_place_that_moves_under_test_looks_like_others_that_move(scene: Image) -> None:
+    image, box, search = remembered(scene)
     evidence = []
     for residual in (UNKNOWN, everywhere(20.0), everywhere(1.0)):
         search._moving = residual
@@ -266,12 +270,7 @@ def test_a_place_that_moves_under_test_looks_like_others_that_move(scene: Image)
 
 def test_a_place_of_half_the_predicted_size_is_less_probable(scene: Image) -> None:
     """Under test a look-alike shrank from frame to frame: the foot of a tree, 7 px wide, became a boat of 14 px."""
-    place = np.array([120.0, 120.0])
-    image, box = painted(scene, place), OrientedBox(*place, *map(float, TARGET))
-    memory = TemplateMemory()
-    memory.add(image, box)
-    answer = Response(0.0, 0.0, 0.0, 1.0)
-    search = Redetection(SIZE, memory, memory, lambda image, box: (box, answer), ColourModel(image, box))
+    image, box, search = remembered(scene)
     evidence = []
     for factor in (1.0, 1.25, 2.0):
         expected = replace(prediction(120.0), box=box.sized(factor * box.sides))
