@@ -197,3 +197,18 @@ def test_a_seed_is_of_a_simulated_world(tmp_path: Path, capsys: pytest.CaptureFi
     config.write_text('id = "cam0"\nsite = "a"\ndriver = "video"\n[video]\nsource = "a.mp4"\n', encoding="utf-8")
     assert run(["camera", str(config), "--print-config", "--seed", "9"]) == 2
     assert "--seed is of a simulated world" in capsys.readouterr().err
+
+
+def test_an_agent_outlives_the_reader_of_its_statuses(tmp_path: Path) -> None:
+    """Where the pipe was closed, as by `head -1`, it ended with status 0, and no supervisor started it again."""
+    config = tmp_path / "cam.toml"
+    config.write_text('id = "cam0"\nsite = "a"\ndriver = "simulated"\n', encoding="utf-8")
+    command = [sys.executable, "-m", "deploy", "camera", str(config), "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=ROOT) as agent:
+        assert agent.stdout is not None
+        assert json.loads(agent.stdout.readline())["agent"] == "cam0"
+        agent.stdout.close()
+        with pytest.raises(subprocess.TimeoutExpired):
+            agent.wait(2.5)  # a status a second
+        agent.terminate()
+    assert agent.returncode == 0
