@@ -11,6 +11,7 @@ from hub.calibration.pipeline import calibrate
 from protocols.geometry.camera import Intrinsics
 from protocols.session.observations import Observations
 from tests.bench.clock_models import World, reported, session
+from tests.support.rigs import simulate
 from tests.unit.hub.bundle.test_timestamp_jitter import jittery
 
 USUAL = World(seconds=40.0, noise=0.5, fps=(30.0, 25.0, 29.97, 50.0), fastest=0.7, focal_error=0.0, labels=1)
@@ -92,6 +93,21 @@ def test_a_clock_step_is_neither_a_frame_rate_nor_a_refused_camera(effect: str, 
         for (at, size, _), (when, estimate, _) in zip(clocks[name].steps, camera.clock_steps, strict=True):
             assert abs(when - at) < 0.2
             assert abs(estimate - size) < 0.005
+
+
+def test_a_rate_beside_a_step_is_less_certain() -> None:
+    """Two halves of a recording with a free step between them give a rate a quarter of its information: it had a std
+    as of one whole, and was off by twice it (rms of twelve simulated rigs)."""
+    usual = simulate(5, 3, 80.0, fps=(30.0, 30.0, 30.0))
+    tracks = usual.observations().tracks
+    middle = usual.middle("cam2")
+    stepped = {
+        key: replace(track, time=track.time + 0.05 * (track.time >= middle)) if key[0] == "cam2" else track
+        for key, track in tracks.items()
+    }
+    even, found = (calibrate(usual.rig, Observations(one)).cameras["cam2"] for one in (tracks, stepped))
+    assert len(found.clock_steps) == 1
+    assert found.clock_rate_std / even.clock_rate_std == pytest.approx(2.0, rel=0.2)
 
 
 def test_jitter_of_few_frames_is_no_step() -> None:
