@@ -52,6 +52,9 @@ from protocols.session.rig import Rig, longest_readout
 _SHORT_GAPS, _MAX_NOMINAL = 0.05, 4.0
 """Quantile of a camera's gaps between rows that stands for consecutive frames, and how much faster than those its
 nominal rate may be: a target seen in every fourth frame at best."""
+_LEAST_ROUNDING_S, _ROUNDING_FRAMES = 5e-4, 30
+"""Rounding [s] below which it moves a lag less than other errors do; frames over which its errors are compared: few
+enough that the pattern of a clock 20 ppm beside a round rate stays."""
 _MAX_SAMPLES = 4_000_000
 """Of one path: 4.6 hours at 240 Hz."""
 
@@ -310,12 +313,34 @@ def _with_correction_errors(
     variance = std**2 + sum(
         (one.rate_std if derivative else one.std) ** 2 for one in state.wanders if one.camera in (camera, reference)
     )
+    for one in (camera, reference):
+        variance += _rounding_std(np.concatenate([rows.stamps for rows in problem.of_camera(one)]))[derivative] ** 2
     for step in state.clock_steps:
         if step.camera in (camera, reference):  # its size moves the line through all rows as it moves those beyond it
             times = np.concatenate([rows.time[rows.use] for rows in problem.of_camera(step.camera)])
             beyond = (times >= step.time) == (step.time > state.cameras[step.camera].centre)
             variance += (step.std * np.polynomial.polynomial.polyfit(times - times.mean(), beyond, 1)[derivative]) ** 2
     return float(np.sqrt(variance))
+
+
+def _rounding_std(stamps: Floats) -> tuple[float, float]:
+    """Stds of an even clock's offset [s] and rate by how its stamps [s] are rounded: 0 where they are not.
+
+    At 30 frames a second and 10 ms each third error is the same, and their mean is anything up to a sixth of 10 ms.
+    """
+    times = np.unique(stamps)
+    gaps = np.diff(times)
+    unit = 1e-6 * float(np.gcd.reduce(np.rint(1e6 * gaps).astype(np.int64))) if len(gaps) > 1 else 0.0
+    if unit < _LEAST_ROUNDING_S:
+        return 0.0, 0.0
+    frame = np.r_[0.0, np.cumsum(np.rint(gaps / np.mean(gaps[gaps < 1.5 * np.median(gaps)])))]
+    error = times - np.polynomial.Polynomial.fit(frame, times, 1)(frame)
+    parts = np.array_split(error, max(1, len(error) // _ROUNDING_FRAMES))
+    spread = float(np.median([np.ptp(part) for part in parts]))
+    if not 0.01 * unit < spread < unit:  # even stamps, or those of an uneven clock
+        return 0.0, 0.0
+    room = unit - spread  # by which an even clock can be shifted while all stamps are its roundings
+    return room / 12.0**0.5, room / float(np.ptp(times)) / 3.0**0.5
 
 
 def _rms(problem: Problem, state: AdjustmentState, camera: int) -> float:
