@@ -112,7 +112,8 @@ def read_telemetry_log(file: Path, source: tuple[str, str] | None = None) -> Tel
         if turned is None or (samples and time <= samples[-1].time):
             left_out += 1
             continue
-        samples.append(Telemetry(time, turned, np.array(message.position) if message.position else None))
+        position = np.array(message.position) if message.position else None
+        samples.append(Telemetry(time, turned, position, message.position_std))
     if not found:
         of = "" if source is None else f" of the run of {source[0]} that has the images"
         raise InputError(

@@ -138,16 +138,18 @@ def read_telemetry(file: Path) -> TelemetryFile:
     table = table[fresh]
     # Positions often come less often than attitudes.
     placed = np.isfinite(table[:, 5:]).all(axis=1) & (table.shape[1] == 8)
+    stds = np.zeros(len(table))
     if placed.any() and not placed.all():
-        table[~placed, 5:] = interpolate_positions([(row[0], row[5:]) for row in table[placed]], table[~placed, 0])
+        known = [(row[0], row[5:]) for row in table[placed]]
+        table[~placed, 5:], stds[~placed] = interpolate_positions(known, table[~placed, 0])
     unused = () if position else tuple(name for name in (*_POSITION, *_GEODETIC) if name in cells.columns)
-    return TelemetryFile(tuple(_sample(row) for row in table), left_out, back, unused=unused)
+    return TelemetryFile(tuple(map(_sample, table, stds)), left_out, back, unused=unused)
 
 
-def _sample(row: Floats) -> Telemetry:
-    """A sample from a row with time, quaternion and, if present, position."""
+def _sample(row: Floats, position_std: float) -> Telemetry:
+    """A sample from a row with time, quaternion and, if present, position; and the std [m] of that."""
     position = row[5:8].copy() if len(row) == 8 and np.isfinite(row[5:8]).all() else None
-    return Telemetry(float(row[0]), so3.from_quaternion(row[1:5]), position)
+    return Telemetry(float(row[0]), so3.from_quaternion(row[1:5]), position, float(position_std))
 
 
 def check_clock(samples: Sequence[Telemetry], file: Path, start: float, end: float) -> list[str]:

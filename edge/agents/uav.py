@@ -299,6 +299,7 @@ class UavAgent:
         )
         if sample.position is not None:
             message.position.extend(sample.position.tolist())
+            message.position_std = sample.position_std
         origin = self._vehicle.origin
         if origin is not None:
             message.origin.extend((origin.latitude, origin.longitude, float(np.clip(origin.altitude, -1e4, 1e5))))

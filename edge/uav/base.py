@@ -55,12 +55,13 @@ class Telemetry:
     """One telemetry sample, stamped by the telemetry's own clock [s].
 
     ned_from_body: (3, 3), v_ned = R v_body, body axes forward-right-down. position: (3,) north, east, down [m],
-    or None.
+    or None. position_std: of it, one coordinate [m], by the time to the reports that it was computed from.
     """
 
     time: float
     ned_from_body: Floats
     position: Floats | None = None
+    position_std: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

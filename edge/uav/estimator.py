@@ -128,7 +128,7 @@ class TargetEstimator:
         position = np.array(message.position) if message.position else None
         if message.origin:
             self.origin = Origin(*message.origin)
-        sample = Telemetry(message.device_time_ns / NANOSECONDS, rotation, position)
+        sample = Telemetry(message.device_time_ns / NANOSECONDS, rotation, position, message.position_std)
         self._samples.append(sample)
         if self._georeference is not None:
             self._georeference.add(sample)

@@ -61,7 +61,7 @@ class Georeference:
         self._telemetry = TelemetryTrack(np.asarray(body_from_camera), _LONGEST_GAP_S)
         self._centre: Floats | None = None
         self._frame: tuple[int, ...] | None = None
-        self._known_s = self._start_std = 0.0  # since when the ground frame drifts, and its std [m] by then
+        self._known_s = self._known_std = 0.0  # since when the ground frame drifts, and its std [m] by then
         self.offset: Floats | None = None
 
     def add(self, sample: Telemetry) -> None:
@@ -90,20 +90,22 @@ class Georeference:
         place = np.array([estimate.north, estimate.east])
         if estimate.ground_frame != self._frame:
             self._frame, self.offset, self._known_s = estimate.ground_frame, None, time
-            self._start_std = self._std_of_start(estimate, time)
+            self._known_std = self._std_of_start(estimate, time)
         measured = None if self._clock_std_s else self.locate(estimate.x, estimate.y, time)
         if measured is not None:
             difference = measured - place
             gain = 1.0 if self.offset is None else -math.expm1(-max(time - self._known_s, 0.0) / _TIME_CONSTANT_S)
             self.offset = difference if self.offset is None else self.offset + gain * (difference - self.offset)
-            self._known_s, self._start_std = time, 0.0
+            # Errors of one report's positions are alike: the mean of the stds, not of their squares.
+            self._known_std += gain * (self._telemetry.position_std_at(time) - self._known_std)
+            self._known_s = time
         if self.offset is not None:
             place = place + self.offset
         centre = self._telemetry.position_at(self._telemetry.nearest_time(time) if self._centre is None else time)
         self._centre = centre = self._centre if centre is None else centre
         drift = _DRIFT_M_S * (time - self._known_s)
         ground = 0.0 if centre is None else _ground_std(place, centre)
-        std_m = math.hypot(estimate.std_m, ground, drift, self._start_std)
+        std_m = math.hypot(estimate.std_m, ground, drift, self._known_std)
         return replace(estimate, north=float(place[0]), east=float(place[1]), std_m=std_m)
 
     def _std_of_start(self, estimate: Estimate, time: float) -> float:
@@ -115,4 +117,4 @@ class Georeference:
         speed = _CRUISE_M_S
         if late > early and places[0] is not None and places[1] is not None:
             speed = float(np.hypot(*(places[1] - places[0]))) / (late - early)
-        return speed * off / math.sqrt(2.0)
+        return math.hypot(speed * off / math.sqrt(2.0), self._telemetry.position_std_at(nearest))

@@ -14,21 +14,36 @@ from protocols.geometry.types import Floats
 _EARTH_RADIUS_M = 6_378_137.0  # semi-major axis of the WGS 84 ellipsoid
 _ECCENTRICITY2 = 6.694379990141317e-3  # squared, of the WGS 84 ellipsoid
 _POSITION_GAP_S = 3.0  # greatest interval over which positions are interpolated
+_ACCELERATION_STD_M_S2 = 10.0
+"""Of a vehicle that manoeuvres. Beside positions at 1 Hz, of one that braked at 1, 2 and 4 g, the errors of a target's
+place were up to 0.9, 1.6 and 2.4 of its stds."""
 
 
-def interpolate_positions(positions: list[tuple[float, Floats]], times: Floats) -> Floats:
-    """Positions (n, 3) at ``times`` (n,) [s], interpolated between those of given times; NaN where none are close."""
-    out = np.full((len(times), 3), np.nan)
+def position_std(since: Floats | float, until: Floats | float) -> Any:
+    """Std [m], one coordinate, of a position interpolated between reports, or extrapolated at the speed of one.
+
+    since, until: times [s] to the reports before and after it; to the one report both.
+    """
+    return 0.5 * _ACCELERATION_STD_M_S2 * np.abs(since * until)
+
+
+def interpolate_positions(positions: list[tuple[float, Floats]], times: Floats) -> tuple[Floats, Floats]:
+    """Positions (n, 3) at ``times`` (n,) [s], interpolated between those of given times; NaN where none are close.
+
+    And their stds (n,) by the time to these.
+    """
+    out, std = np.full((len(times), 3), np.nan), np.zeros(len(times))
     ordered = sorted(positions, key=lambda entry: entry[0])
     if len(ordered) < 2:
-        return out
+        return out, std
     known = np.array([moment for moment, _ in ordered])
     table = np.array([position for _, position in ordered])
     index = np.clip(np.searchsorted(known, times) - 1, 0, len(known) - 2)
-    near = (known[index + 1] - known[index] <= _POSITION_GAP_S) & (times >= known[0] - 0.5) & (times <= known[-1] + 0.5)
-    for axis in range(3):
-        out[near, axis] = np.interp(times[near], known, table[:, axis])
-    return out
+    gap = known[index + 1] - known[index]
+    near = (gap <= _POSITION_GAP_S) & (times >= known[0] - 0.5) & (times <= known[-1] + 0.5)
+    share = (times - known[index]) / np.maximum(gap, 1e-9)
+    out[near] = (table[index] + share[:, None] * (table[index + 1] - table[index]))[near]
+    return out, position_std(times - known[index], known[index + 1] - times)
 
 
 def rotation_from_euler(roll: float, pitch: float, yaw: float) -> Floats:

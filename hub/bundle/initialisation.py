@@ -43,6 +43,10 @@ _PNP_THRESHOLD_PX = 8.0  # generous: the first trajectory is rough
 _MIN_PNP_POINTS = 12  # twice the six unknowns of a pose
 MIN_KNOT_SPACING, _MAX_KNOT_SPACING = 0.05, 0.3  # s
 _FEW_FRAMES_PER_KNOT, _MANY_ROWS = 4.5, 3.0  # of a track's choice; of all cameras, to each of twice as many knots
+_LEAST_ROWS = 1.9
+"""Rows of all cameras to each knot, three unknowns: of 1.5 or hardly more the prior says where the path is, and two
+cameras at 5 frames a second turned by up to 3 degrees, at 57 stds. Not 2: two of one frame rate would see one phase of
+all knot intervals, and what a cubic spline does not follow would move their clocks (by 0.6 ms, at 20 stds)."""
 _MANY_TRACKS = 2.0**4.5
 """Tracks at once, of all labels and cameras, whose best spacing is nearer to half of one track's: what a cubic spline
 does not follow goes with the fourth power of its spacing, squared, against a variance that goes with 1 / (spacing times
@@ -357,15 +361,18 @@ def triangulate_label(
     # Rows of a single camera far from two-camera stretches are not covered: they do not constrain the adjustment.
     begins, ends = split_at_gaps(time[good], _MAX_GAP)
     spacing = knot_spacing([cameras[name] for name in names], label, len(cameras) > LARGE_NETWORK)
+    inside = [np.searchsorted(state.reference_time(track.time), [begins, ends]) for state, track in seeing]
+    rows = max(1, sum(int(np.diff(one, axis=0).sum()) for one in inside))
+    spacing = max(spacing, min(_LEAST_ROWS * float((ends - begins).sum()) / rows, _MAX_GAP))
     basis = SplineBasis.covering(begins - 0.5 * spacing, ends + 0.5 * spacing, spacing)
     time, points = time[good], points[good]
-    weight, rows = np.ones(len(time)), basis.weights(time)
-    control = fit_spline(basis, rows, points, weight, 1e-2)
+    weight, at = np.ones(len(time)), basis.weights(time)
+    control = fit_spline(basis, at, points, weight, 1e-2)
     for _ in range(3):
-        distance = np.linalg.norm(weighted_sums(control, *rows[:2]) - points, axis=1)
+        distance = np.linalg.norm(weighted_sums(control, *at[:2]) - points, axis=1)
         scale = max(1.4826 * float(np.median(distance)), 1e-9)
         weight = 1.0 / (1.0 + (distance / (3.0 * scale)) ** 2)
-        control = fit_spline(basis, rows, points, weight, 1e-2)
+        control = fit_spline(basis, at, points, weight, 1e-2)
     return Trajectory(basis, control)
 
 

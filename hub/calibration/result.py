@@ -52,6 +52,9 @@ from protocols.session.rig import Rig, longest_readout
 _SHORT_GAPS, _MAX_NOMINAL = 0.05, 4.0
 """Quantile of a camera's gaps between rows that stands for consecutive frames, and how much faster than those its
 nominal rate may be: a target seen in every fourth frame at best."""
+_LEAST_ROUNDING_S, _ROUNDING_FRAMES = 5e-4, 30
+"""Rounding [s] below which it moves a lag less than other errors do; frames over which its errors are compared: few
+enough that the pattern of a clock 20 ppm beside a round rate stays."""
 _MAX_SAMPLES = 4_000_000
 """Of one path: 4.6 hours at 240 Hz."""
 
@@ -138,7 +141,7 @@ def assemble_calibration(
         instants = {i: float(camera.camera_time(there)[0]) for i, camera in enumerate(state.cameras)} | instants
     lag_times = [instants.get(i, middle) for i, middle in enumerate(middle_times)]
     rate_stds = [
-        cov.clock_rate_std(covariance, state, i, reference) if problem.free_parameters.clock else 0.0
+        cov.clock_rate_std(covariance, state, i, reference) if problem.free_parameters.clock and i != reference else 0.0
         for i in range(len(names))
     ]
     # Of the maps onto the reference camera's clock, in the middle of their common span.
@@ -170,9 +173,7 @@ def assemble_calibration(
             readout_std=float(readout_stds[i]) / time_scales[i],
             lag_time=float(lag_times[i]) / time_scales[i] + time_origins[i],
             lag_std=lag_stds[i] / time_scales[reference],
-            clock_rate_std=float(
-                np.linalg.norm([rate_stds[i], *(one.rate_std for one in state.wanders if one.camera in (i, reference))])
-            ),
+            clock_rate_std=_with_correction_errors(rate_stds[i], problem, state, i, reference, derivative=1),
             sensitivities=effects[i],
             clock_steps=tuple(
                 (step.time / time_scales[i] + time_origins[i], step.size / time_scales[i], step.std / time_scales[i])
@@ -296,21 +297,50 @@ def _detector_z(prepared: PreparedSession, name: str, sigma: float) -> float:
 def _time_map_std(
     problem: Problem, state: AdjustmentState, covariance: cov.Covariance, camera: int, reference: int
 ) -> float:
-    if not problem.free_parameters.clock or camera == reference:
+    if not problem.free_parameters.clock:
         return 0.0
     return _with_correction_errors(
         cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference
     )
 
 
-def _with_correction_errors(std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int) -> float:
-    variance = std**2 + sum(one.std**2 for one in state.wanders if one.camera in (camera, reference))
+def _with_correction_errors(
+    std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int, derivative: int = 0
+) -> float:
+    """The std of a map, or of its rate (derivative 1), with that of both clocks' steps and wander; a reference: 0."""
+    if camera == reference:
+        return 0.0
+    variance = std**2 + sum(
+        (one.rate_std if derivative else one.std) ** 2 for one in state.wanders if one.camera in (camera, reference)
+    )
+    for one in (camera, reference):
+        variance += _rounding_std(np.concatenate([rows.stamps for rows in problem.of_camera(one)]))[derivative] ** 2
     for step in state.clock_steps:
-        if step.camera in (camera, reference):  # its size moves the map by the share of the rows beyond it
-            rows = [rows.time[rows.use] for rows in problem.of_camera(step.camera)]
-            after = float(np.mean(np.concatenate(rows) >= step.time))
-            variance += (step.std * (after if step.time > state.cameras[step.camera].centre else 1.0 - after)) ** 2
+        if step.camera in (camera, reference):  # its size moves the line through all rows as it moves those beyond it
+            times = np.concatenate([rows.time[rows.use] for rows in problem.of_camera(step.camera)])
+            beyond = (times >= step.time) == (step.time > state.cameras[step.camera].centre)
+            variance += (step.std * np.polynomial.polynomial.polyfit(times - times.mean(), beyond, 1)[derivative]) ** 2
     return float(np.sqrt(variance))
+
+
+def _rounding_std(stamps: Floats) -> tuple[float, float]:
+    """Stds of an even clock's offset [s] and rate by how its stamps [s] are rounded: 0 where they are not.
+
+    At 30 frames a second and 10 ms each third error is the same, and their mean is anything up to a sixth of 10 ms.
+    """
+    times = np.unique(stamps)
+    gaps = np.diff(times)
+    unit = 1e-6 * float(np.gcd.reduce(np.rint(1e6 * gaps).astype(np.int64))) if len(gaps) > 1 else 0.0
+    if unit < _LEAST_ROUNDING_S:
+        return 0.0, 0.0
+    frame = np.r_[0.0, np.cumsum(np.rint(gaps / np.mean(gaps[gaps < 1.5 * np.median(gaps)])))]
+    error = times - np.polynomial.Polynomial.fit(frame, times, 1)(frame)
+    parts = np.array_split(error, max(1, len(error) // _ROUNDING_FRAMES))
+    spread = float(np.median([np.ptp(part) for part in parts]))
+    if not 0.01 * unit < spread < unit:  # even stamps, or those of an uneven clock
+        return 0.0, 0.0
+    room = unit - spread  # by which an even clock can be shifted while all stamps are its roundings
+    return room / 12.0**0.5, room / float(np.ptp(times)) / 3.0**0.5
 
 
 def _rms(problem: Problem, state: AdjustmentState, camera: int) -> float:

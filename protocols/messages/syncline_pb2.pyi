@@ -534,7 +534,7 @@ class FlightImage(_message.Message):
     def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., order: _Optional[int] = ..., frame: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., jpeg: _Optional[bytes] = ...) -> None: ...
 
 class VehicleTelemetry(_message.Message):
-    __slots__ = ("schema_version", "agent", "boot_id", "order", "device_time_ns", "vehicle_time_ns", "time_std_s", "ned_from_body", "position", "origin")
+    __slots__ = ("schema_version", "agent", "boot_id", "order", "device_time_ns", "vehicle_time_ns", "time_std_s", "ned_from_body", "position", "origin", "position_std")
     SCHEMA_VERSION_FIELD_NUMBER: _ClassVar[int]
     AGENT_FIELD_NUMBER: _ClassVar[int]
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
@@ -545,6 +545,7 @@ class VehicleTelemetry(_message.Message):
     NED_FROM_BODY_FIELD_NUMBER: _ClassVar[int]
     POSITION_FIELD_NUMBER: _ClassVar[int]
     ORIGIN_FIELD_NUMBER: _ClassVar[int]
+    POSITION_STD_FIELD_NUMBER: _ClassVar[int]
     schema_version: int
     agent: str
     boot_id: str
@@ -555,7 +556,8 @@ class VehicleTelemetry(_message.Message):
     ned_from_body: _containers.RepeatedScalarFieldContainer[float]
     position: _containers.RepeatedScalarFieldContainer[float]
     origin: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., order: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., vehicle_time_ns: _Optional[int] = ..., time_std_s: _Optional[float] = ..., ned_from_body: _Optional[_Iterable[float]] = ..., position: _Optional[_Iterable[float]] = ..., origin: _Optional[_Iterable[float]] = ...) -> None: ...
+    position_std: float
+    def __init__(self, schema_version: _Optional[int] = ..., agent: _Optional[str] = ..., boot_id: _Optional[str] = ..., order: _Optional[int] = ..., device_time_ns: _Optional[int] = ..., vehicle_time_ns: _Optional[int] = ..., time_std_s: _Optional[float] = ..., ned_from_body: _Optional[_Iterable[float]] = ..., position: _Optional[_Iterable[float]] = ..., origin: _Optional[_Iterable[float]] = ..., position_std: _Optional[float] = ...) -> None: ...
 
 class TargetCommand(_message.Message):
     __slots__ = ("schema_version", "agent", "boot_id", "order", "kind", "box", "by")

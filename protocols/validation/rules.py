@@ -557,6 +557,7 @@ def _vehicle_telemetry(message: pb.VehicleTelemetry) -> None:
     if abs(sum(part * part for part in message.ned_from_body) - 1.0) > 1e-6:
         raise Rejected(RejectionReason.OUT_OF_RANGE, "ned_from_body is no rotation")
     _bounded(message.position, "position", (0, 3), MAX_METRES)
+    _number(message.position_std, "position_std", 0.0, MAX_METRES)
     _geodetic(message.origin, "origin")
 
 

@@ -163,9 +163,9 @@ def _samples(boot: list[tuple[float, Any]], kind: str, local: bool) -> tuple[tup
                 frame.take_local(telemetry, time)
             if frame.position is not None and isinstance(telemetry, LocalPosition) == local:
                 positions.append((time, frame.position[1]))
-    positions_at = interpolate_positions(positions, np.array([attitude.boot_s for attitude in attitudes]))
+    places, stds = interpolate_positions(positions, np.array([attitude.boot_s for attitude in attitudes]))
     samples = tuple(
-        Telemetry(attitude.boot_s, attitude.ned_from_body, None if np.isnan(position).any() else position)
-        for attitude, position in zip(attitudes, positions_at, strict=True)
+        Telemetry(attitude.boot_s, attitude.ned_from_body, None if np.isnan(place).any() else place, float(std))
+        for attitude, place, std in zip(attitudes, places, stds, strict=True)
     )
     return samples, left_out

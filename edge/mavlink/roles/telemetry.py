@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from edge.mavlink.dialect import mavlink
-from edge.uav.navigation import Origin, rotation_from_euler, rotation_from_quaternion
+from edge.uav.navigation import Origin, position_std, rotation_from_euler, rotation_from_quaternion
 from protocols.geometry import so3
 from protocols.geometry.types import Floats
 
@@ -172,12 +172,13 @@ class LocalFrame:
         last, position, velocity = self.position
         return np.asarray(position + (time - last) * velocity), velocity
 
-    def measured_at(self, time: float) -> Floats | None:
-        """Position (3,) at a time; None where a report is missing, from which on `at` is a guess."""
-        if self.position is None or abs(time - self.position[0]) >= max(2.0 * self._interval_s, _SMOOTH_S):
-            return None
+    def measured_at(self, time: float) -> tuple[Floats | None, float]:
+        """Position (3,) at a time and its std [m]; None where a report is missing, from which on `at` is a guess."""
         known = self.at(time)
-        return None if known is None else known[0]
+        age = 0.0 if self.position is None else abs(time - self.position[0])
+        if known is None or age >= max(2.0 * self._interval_s, _SMOOTH_S):
+            return None, 0.0
+        return known[0], float(position_std(age, age))
 
     def take_local(self, report: LocalPosition, time: float) -> None:
         """Add a local position. A jump that its velocity does not explain is one of its frame, until a global one."""

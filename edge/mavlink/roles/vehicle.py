@@ -44,7 +44,7 @@ class MountSample:
     """A telemetry sample. host_ns, vehicle_ns: time of measurement on the host's and the autopilot's clock.
 
     std_s: of host_ns. ned_from_mount: (3, 3) of the camera's mount (airframe or gimbal). position: (3,) NED [m] from
-    the vehicle's ``origin``, None where no report was due so near that it is known.
+    the vehicle's ``origin``, None where no report was due so near that it is known. position_std: of it [m].
     """
 
     host_ns: int
@@ -52,6 +52,7 @@ class MountSample:
     std_s: float
     ned_from_mount: Floats
     position: Floats | None
+    position_std: float = 0.0
 
 
 class Vehicle:
@@ -247,7 +248,6 @@ class Vehicle:
         if self._sample_s != _NEVER:
             self._spacing_s += 0.2 * (min(time - self._sample_s, _MISSING_AFTER_S) - self._spacing_s)
         self._sample_s = time
-        position = self.frame.measured_at(time)
         vehicle_ns = host_ns + (self.clock.offset_ns if self.clock.known else clock.offset_ns)
-        self.mount = MountSample(host_ns, vehicle_ns, clock.std_s, rotation, position)
+        self.mount = MountSample(host_ns, vehicle_ns, clock.std_s, rotation, *self.frame.measured_at(time))
         return [self.mount]

@@ -193,6 +193,7 @@ class AppearanceTracker:
         if self._missed:
             self._motion_filter.turn(self._turned)
         self.box = box.at(origin + self._motion_filter.predict(dt, self.length))
+        self._lead = np.zeros(2)
         self._sure = sure.at(sure.centre + velocity.predict(dt, self.length)), velocity
         if expected is not None:
             self._use(expected)
@@ -216,6 +217,8 @@ class AppearanceTracker:
             clear = self.motion.trusted and self.motion.share > _MOST_OF_SCENE
             self.follows = not clear or bool(np.hypot(*(box.centre - self.box.centre)) < self.length)
             if self.follows:
+                if self._time - self._trusted_at >= _FAST_PAN_S:  # before, the step may be the camera's
+                    self._lead = box.centre - self.box.centre
                 self.box, self._other_std = box, expected.std
             if not self.motion.trusted:
                 self._sure = self.box, copy(self._motion_filter)
@@ -240,7 +243,7 @@ class AppearanceTracker:
             self._learn_first(image)
 
     def _go_to(self, place: OrientedBox, velocity: Floats) -> None:
-        self.box = place
+        self.box, self._lead = place, np.zeros(2)  # of another tracker's place before the filter's own [px]
         self._motion_filter.restart(velocity, _FIRST_STD * self.length, self.length)
         self._sure = place, copy(self._motion_filter)
 
@@ -305,7 +308,7 @@ class AppearanceTracker:
         inside = box.share_inside(self._size)
         # Where it looks less like the target than what is beside it, it says little about how the target moves.
         unsure = 1.0 - inside if self._ratio > 0.0 else 1.0
-        self._motion_filter.correct(box.centre - self.box.centre, self.length, unsure)
+        self._motion_filter.correct(self._lead + box.centre - self.box.centre, self.length, unsure)
         wider, higher, turn = self._flow.change(image, box, stood) if inside > _SIZE_INSIDE else (1.0, 1.0, 0.0)
         box = box.sized(box.sides * [wider, higher]).turned(turn)
         if inside > _LEARN_INSIDE:

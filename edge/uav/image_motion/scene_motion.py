@@ -31,6 +31,9 @@ _BACKWARD_PX = 0.7  # forward-backward distance of a good track [px of the worki
 _RANSAC_PX = 1.5  # residual of a track of the static scene [px of the working image]
 _BENT = 0.04  # of the shift by a turn: mean of (x/f)^2 over half an image as wide as its focal length
 _MIN_TRACKS, _MIN_SHARE = 12, 0.35  # of a trusted motion: static tracks, and their share
+_MIN_PLACES, _PLACE = 4, 0.125
+"""Places of them, so far apart over the image's width: a similarity fits what moves at two. Of real videos seven or
+more, of three cars on snow three."""
 _MOST_STAND = 0.5  # share of the tracks off what seems burnt in, that move alike where it is
 _PARTS, _VOTE_PX = (4, 2), 2  # parts that are searched after a fast pan; agreement of their shifts [px, reduced]
 _FEATURES, _FEATURE_STEP = 800, 7  # that are matched: number, and grey levels by which they stand out of dull ground
@@ -284,11 +287,20 @@ class SceneMotion:
         residual = new - (old @ matrix[:, :2].T + matrix[:, 2])
         near = np.square(residual).sum(axis=1) < (tolerance * _PARALLAX_PX) ** 2
         zoom = float(np.hypot(matrix[0, 0], matrix[1, 0]))
-        trusted = bool(int(mask.sum()) >= _MIN_TRACKS and share > _MIN_SHARE and 1.0 / _MOST_ZOOM < zoom < _MOST_ZOOM)
+        enough = int(mask.sum()) >= _MIN_TRACKS and share > _MIN_SHARE and self._are_spread(old[mask])
+        trusted = bool(enough and 1.0 / _MOST_ZOOM < zoom < _MOST_ZOOM)
         full = self._to_full(np.asarray(matrix, np.float64))
         points = self._scale * (old[near] + 0.5) - 0.5
         centre = 0.5 * (self._scale * np.array(self._size, dtype=np.float64) - 1.0)
         return Motion(full, points, self._scale * residual[near], trusted, share, centre)
+
+    def _are_spread(self, points: Floats) -> bool:
+        """Whether points (n, 2) [px of the working image] lie at several places, not on what moves alone."""
+        for _ in range(_MIN_PLACES):
+            if not len(points):
+                return False
+            points = points[np.square(points - points[0]).sum(axis=1) > (_PLACE * self._size[0]) ** 2]
+        return True
 
     def _to_full(self, matrix: Floats) -> Floats:
         out = matrix.copy()

@@ -41,6 +41,7 @@ class TelemetryTrack:
         self._times: deque[float] = deque(maxlen=_BUFFER)
         self._rotations: deque[Floats] = deque(maxlen=_BUFFER)
         self._positions: deque[Floats | None] = deque(maxlen=_BUFFER)
+        self._position_stds: deque[float] = deque(maxlen=_BUFFER)
         self._pending: deque[tuple[float, Floats]] = deque(maxlen=_BUFFER)
         self._visual_times: deque[float] = deque(maxlen=_BUFFER)
         self._visual: deque[Floats] = deque(maxlen=_BUFFER)
@@ -67,7 +68,7 @@ class TelemetryTrack:
             self._set_back = self._set_back + 1 if sample.time < self._times[-1] - _MAX_GAP_S else 0
             valid = self._set_back >= _CONFIRMING_SAMPLES
             if valid:
-                for samples in (self._times, self._rotations, self._positions, self._pending):
+                for samples in (self._times, self._rotations, self._positions, self._position_stds, self._pending):
                     samples.clear()
         if not valid:
             self.rejected += 1
@@ -80,6 +81,7 @@ class TelemetryTrack:
         self._times.append(float(sample.time))
         self._rotations.append(camera_from_ned)
         self._positions.append(position)
+        self._position_stds.append(sample.position_std)
         self._pending.append((float(sample.time), camera_from_ned))
 
     @property
@@ -111,6 +113,11 @@ class TelemetryTrack:
         if first is None or second is None:
             return None
         return np.asarray(first + fraction * (second - first))
+
+    def position_std_at(self, time: float) -> float:
+        """Std [m], one coordinate, of ``position_at``, as the samples have it; 0 where they are not near."""
+        bracket = self._bracket(time + self.offset, 0.25)
+        return 0.0 if bracket is None else max(self._position_stds[bracket[0]], self._position_stds[bracket[0] + 1])
 
     def nearest_time(self, time: float) -> float:
         """The time within the samples' span that is nearest to a camera time; that time without samples."""

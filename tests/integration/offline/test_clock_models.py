@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from hub.calibration.pipeline import calibrate
+from hub.calibration.result import _rounding_std
 from protocols.geometry.camera import Intrinsics
 from protocols.session.observations import Observations
 from tests.bench.clock_models import World, reported, session
+from tests.support.rigs import simulate
 from tests.unit.hub.bundle.test_timestamp_jitter import jittery
 
 USUAL = World(seconds=40.0, noise=0.5, fps=(30.0, 25.0, 29.97, 50.0), fastest=0.7, focal_error=0.0, labels=1)
@@ -92,6 +94,36 @@ def test_a_clock_step_is_neither_a_frame_rate_nor_a_refused_camera(effect: str, 
         for (at, size, _), (when, estimate, _) in zip(clocks[name].steps, camera.clock_steps, strict=True):
             assert abs(when - at) < 0.2
             assert abs(estimate - size) < 0.005
+
+
+def test_a_rate_beside_a_step_is_less_certain() -> None:
+    """Two halves of a recording with a free step between them give a rate a quarter of its information: it had a std
+    as of one whole, and was off by twice it (rms of twelve simulated rigs)."""
+    usual = simulate(5, 3, 80.0, fps=(30.0, 30.0, 30.0))
+    tracks = usual.observations().tracks
+    middle = usual.middle("cam2")
+    stepped = {
+        key: replace(track, time=track.time + 0.05 * (track.time >= middle)) if key[0] == "cam2" else track
+        for key, track in tracks.items()
+    }
+    even, found = (calibrate(usual.rig, Observations(one)).cameras["cam2"] for one in (tracks, stepped))
+    assert len(found.clock_steps) == 1
+    assert found.clock_rate_std / even.clock_rate_std == pytest.approx(2.0, rel=0.2)
+
+
+def test_coarse_stamps_of_an_even_clock_make_a_lag_less_certain() -> None:
+    """At 30 frames a second and 10 ms each third rounding error is the same: lags were 1.3 ms off at stds of 0.1 ms.
+
+    A clock that drifts goes through all errors, though slowly; those of uneven frames have nothing in common.
+    """
+    rng = np.random.default_rng(1)
+    for drift in (0.0, 2e-5):
+        even = np.delete((np.arange(900) + 0.2) / 30.0 * (1.0 + drift), rng.integers(0, 900, 90))
+        assert _rounding_std(np.asarray(np.round(even, 2)))[0] == pytest.approx(0.01 / 3.0 / 12.0**0.5, rel=0.05)
+        assert _rounding_std(np.asarray(1.7e9 + np.round(even, 3)))[0] == pytest.approx(1e-3 / 3.0 / 12.0**0.5, rel=0.1)
+        assert _rounding_std(np.asarray(np.round(even + rng.normal(0.0, 3e-3, len(even)), 2))) == (0.0, 0.0)
+        assert _rounding_std(even) == (0.0, 0.0)
+    assert _rounding_std(np.arange(900) / 25.0) == (0.0, 0.0)
 
 
 def test_jitter_of_few_frames_is_no_step() -> None:

@@ -436,6 +436,31 @@ def test_a_pan_that_could_not_be_measured_is_not_the_targets_velocity(
     assert np.hypot(*tracker._motion_filter.velocity) < 1.0 * max(TARGET)
 
 
+def test_cars_that_drive_alike_over_snow_are_not_the_scene(scene: Image) -> None:
+    """A similarity fits what moves at two places: their target seemed to stand, and was not seen for a second."""
+    motion, cars = SceneMotion(SIZE), scene[100:124, 100:130]
+    for k in range(6):
+        snow = np.full((SIZE[1], SIZE[0], 3), 235, np.uint8)
+        for x, y in ((20 + 3 * k, 40), (200 + 3 * k, 160)):
+            snow[y : y + 24, x : x + 30] = cars
+        assert not motion.update(snow, None).trusted
+
+
+def test_the_place_of_another_tracker_is_not_the_targets_velocity() -> None:
+    """Over snow, of a place always 3 px beside it: after 1.6 s 18 lengths/s, and its box flew off without it."""
+    tracker = AppearanceTracker(SIZE, FPS)
+    for k in range(25):
+        snow = np.full((SIZE[1], SIZE[0], 3), 235, np.uint8)
+        paint(snow, 160.0, 120.0)
+        if k:
+            tracker.expect(Estimate(k / FPS, TrackState.VISIBLE, 163.0, 118.0, 34.0, 22.0, float("nan"), 1.0))
+            assert tracker.handle_frame(snow, k / FPS).state is TrackState.VISIBLE
+        else:
+            tracker.begin(snow, 0.0, Box(143.0, 109.0, 34.0, 22.0))
+    speed = float(np.hypot(*tracker._motion_filter.velocity))
+    assert speed < 0.2 * max(TARGET), speed / max(TARGET)
+
+
 def _window(scene: Image, right: int, k: int) -> tuple[Image, float]:
     """A standing target, seen by a camera that has turned by some pixels to the right; time of frame k."""
     world = scene.copy()
