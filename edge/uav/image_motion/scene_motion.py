@@ -63,7 +63,7 @@ class Motion:
     residuals: Floats
     trusted: bool
     share: float
-    centre: Floats
+    centre: Floats = field(default_factory=lambda: np.zeros(2))
     bend: Floats = field(default_factory=lambda: np.zeros(2))
 
     @property
@@ -82,7 +82,7 @@ class Motion:
     def at(self, point: Floats, reach: float) -> Floats:
         """Where the static scene at ``point`` (2,) [px] has moved, with the parallax of the tracks within ``reach``."""
         if not self.trusted or len(self.points) < _MIN_TRACKS:
-            return np.asarray(self.matrix[:, :2] @ point + self.matrix[:, 2])
+            return np.asarray(self._base(point[None])[0])
         inside = (np.abs(point - self.centre) <= self.centre).all()
         return self._with_parallax(point, reach) if inside else self.turned._with_parallax(point, reach)
 
@@ -101,10 +101,11 @@ class Motion:
         """Points (n, 2) moved by the similarity and its bend, without parallax."""
         linear = self.matrix[:, :2]
         similar = points @ linear.T + self.matrix[:, 2]
-        moved, origin = similar, linear @ self.centre + self.matrix[:, 2] - self.centre
+        moved: Floats = similar
+        origin = linear @ self.centre + self.matrix[:, 2] - self.centre
         for _ in range(2 if self.bend.any() else 0):
             # Beyond the limit, the bend is that at the limit: half way, so that it is undone on the way back.
-            radius = np.hypot(*(0.5 * (points + moved) - self.centre).T)[:, None]
+            radius = np.maximum(np.hypot(*(0.5 * (points + moved) - self.centre).T), 1.0)[:, None]
             offset = (points - self.centre) * np.minimum(1.0, _MOST_WIDTHS * 2.0 * self.centre[0] / radius)
             depth = np.maximum(1.0 - offset @ self.bend, _LEAST_DEPTH)[:, None]
             moved = similar + (offset @ linear.T + origin) * (1.0 / depth - 1.0)
@@ -119,19 +120,22 @@ class Motion:
         by k t alone, so that far outside the image one unknown is enough, which any step of a pan measures.
         """
         p, moved = self.points - self.centre, self.points @ self.matrix[:, :2].T + self.matrix[:, 2] + self.residuals
-        q, linear, shift = moved - self.centre, self.matrix[:, :2], self.matrix[:, 2]
-        shift = shift + linear @ self.centre - self.centre
+        q, linear = moved - self.centre, self.matrix[:, :2]
+        shift = self.matrix[:, 2] + linear @ self.centre - self.centre
         x, y = np.eye(2)
         similar = [np.outer(p[:, 0], x) + np.outer(p[:, 1], y), np.outer(p[:, 0], y) - np.outer(p[:, 1], x)]
         model = np.stack([*similar, *(np.broadcast_to(axis, p.shape) for axis in (x, y)), q], axis=2)
-        weight, slope = np.ones(len(p)), np.zeros(2)
+        weight: Floats = np.ones(len(p))
         for _ in range(3):
             slope = np.linalg.solve(linear, shift)
             model[:, :, 4] = (p @ slope)[:, None] * q
             weighted = (weight[:, None, None] * model).reshape(-1, 5)
             rows = model.reshape(-1, 5)
-            found = np.linalg.solve(weighted.T @ rows + _NO_BEND, weighted.T @ q.ravel())
-            found[4] = np.clip(found[4], 0.0, _MOST_BEND / (2.0 * self.centre[0]) ** 2)
+            normal, right = weighted.T @ rows + _NO_BEND, weighted.T @ q.ravel()
+            found: Floats = np.asarray(np.linalg.solve(normal, right), np.float64)
+            bent = float(np.clip(found[4], 0.0, _MOST_BEND / (2.0 * self.centre[0]) ** 2))
+            if bent != found[4]:
+                found = np.append(np.linalg.solve(normal[:4, :4], right[:4] - normal[:4, 4] * bent), bent)
             misfit = np.square(q - model @ found).sum(axis=1)
             weight = 1.0 / (1.0 + misfit / (4.0 * max(middle(misfit), 0.04)))
             linear, shift = np.array([[found[0], -found[1]], [found[1], found[0]]]), found[2:4]
@@ -140,7 +144,7 @@ class Motion:
         return replace(motion, residuals=moved - motion._base(self.points))
 
 
-STILL = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), False, 0.0, np.zeros(2))
+STILL = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), False, 0.0)
 
 
 def middle(values: Floats) -> float:
