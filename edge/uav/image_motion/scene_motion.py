@@ -2,13 +2,14 @@
 
 A camera that turns and zooms moves the whole image by one map; one that travels moves near ground more than distant
 background. The map is therefore a similarity fitted to the largest consistent set of tracks, plus a correction at
-the place of interest: a robust linear fit to what the tracks near it move beyond the similarity. A similarity, unlike
-a homography, stays bounded outside the image, where the target is while it is away.
+the place of interest: a robust linear fit to what the tracks near it move beyond the similarity. Outside the image,
+where the target is while it is away, the map is the homography of a camera that turns and zooms, K' R K^-1.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -39,16 +40,22 @@ _FEATURES, _FEATURE_STEP = 800, 7  # that are matched: number, and grey levels b
 _MOST_ZOOM = 2.5  # in one step: a stage of a drone's zoom is 2
 _PARALLAX_PX = 6.0  # largest correction [px of the working image]
 _PARALLAX_PRIOR = (1.0, 2.0, 2.0)  # tracks that say there is none, and that it does not grow
+_MOST_BEND = 6.0  # (width / f)^2 of the widest view: 101 degrees
+_NO_BEND = np.diag([0.0, 0.0, 0.0, 0.0, 1e-9])  # keeps the fit regular where nothing moves
+_MOST_WIDTHS = 2.5  # from the centre, in image widths: about 70 degrees off the axis of a usual lens
+_LEAST_DEPTH = 0.3  # in one step; a place behind the camera would come back from the other side
 _REACH = 0.3  # of the parallax correction, over the image's width
 _BRIGHTER = 0.05  # log change of the exposure from which the flow is computed again without it
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Motion:
     """Image motion between two frames.
 
     matrix: (2, 3) similarity, new from old pixels. points, residuals: (n, 2) old pixels of the static tracks and what
     they moved beyond the similarity [px]. trusted: whether enough of the image moves alike. share: of the tracks.
+    centre: (2,) of the image [px]. bend: (2,) by which a turn of the camera makes it a homography [1/px], 0 in a
+    similarity.
     """
 
     matrix: Floats
@@ -56,6 +63,8 @@ class Motion:
     residuals: Floats
     trusted: bool
     share: float
+    centre: Floats = field(default_factory=lambda: np.zeros(2))
+    bend: Floats = field(default_factory=lambda: np.zeros(2))
 
     @property
     def zoom(self) -> float:
@@ -72,9 +81,12 @@ class Motion:
 
     def at(self, point: Floats, reach: float) -> Floats:
         """Where the static scene at ``point`` (2,) [px] has moved, with the parallax of the tracks within ``reach``."""
-        moved = self.matrix[:, :2] @ point + self.matrix[:, 2]
         if not self.trusted or len(self.points) < _MIN_TRACKS:
-            return np.asarray(moved)
+            return np.asarray(self._base(point[None])[0])
+        inside = (np.abs(point - self.centre) <= self.centre).all()
+        return self._with_parallax(point, reach) if inside else self.turned._with_parallax(point, reach)
+
+    def _with_parallax(self, point: Floats, reach: float) -> Floats:
         near = (self.points - point) / reach
         weight = kept = np.exp(-0.5 * np.square(near).sum(axis=1))
         model = np.column_stack([np.ones(len(near)), near])  # on a plane seen obliquely, parallax grows linearly
@@ -83,7 +95,53 @@ class Motion:
             correction = np.linalg.solve(normal, model.T @ (weight[:, None] * self.residuals))
             misfit = np.square(self.residuals - model @ correction).sum(axis=1)
             weight = kept / (1.0 + misfit / (4.0 * max(middle(misfit), 0.04)))
-        return np.asarray(moved + correction[0])
+        return np.asarray(self._base(point[None])[0] + correction[0])
+
+    def _base(self, points: Floats) -> Floats:
+        """Points (n, 2) moved by the similarity and its bend, without parallax."""
+        linear = self.matrix[:, :2]
+        similar = points @ linear.T + self.matrix[:, 2]
+        moved: Floats = similar
+        origin = linear @ self.centre + self.matrix[:, 2] - self.centre
+        for _ in range(2 if self.bend.any() else 0):
+            # Beyond the limit, the bend is that at the limit: half way, so that it is undone on the way back.
+            radius = np.maximum(np.hypot(*(0.5 * (points + moved) - self.centre).T), 1.0)[:, None]
+            offset = (points - self.centre) * np.minimum(1.0, _MOST_WIDTHS * 2.0 * self.centre[0] / radius)
+            depth = np.maximum(1.0 - offset @ self.bend, _LEAST_DEPTH)[:, None]
+            moved = similar + (offset @ linear.T + origin) * (1.0 / depth - 1.0)
+        return np.asarray(moved)
+
+    @cached_property
+    def turned(self) -> Motion:
+        """As the homography of a camera that turns and zooms, fitted to the same tracks.
+
+        With pixels p, q from the centre it is q = (A p + t) / (1 - k p A^-1 t) for a similarity A, t and k = 1/f^2 of
+        the focal length f, as K' R K^-1 is to the second order in the turn. A turn shifts an image by t and bends it
+        by k t alone, so that far outside the image one unknown is enough, which any step of a pan measures.
+        """
+        p, moved = self.points - self.centre, self.points @ self.matrix[:, :2].T + self.matrix[:, 2] + self.residuals
+        q, linear = moved - self.centre, self.matrix[:, :2]
+        shift = self.matrix[:, 2] + linear @ self.centre - self.centre
+        x, y = np.eye(2)
+        similar = [np.outer(p[:, 0], x) + np.outer(p[:, 1], y), np.outer(p[:, 0], y) - np.outer(p[:, 1], x)]
+        model = np.stack([*similar, *(np.broadcast_to(axis, p.shape) for axis in (x, y)), q], axis=2)
+        weight: Floats = np.ones(len(p))
+        for _ in range(3):
+            slope = np.linalg.solve(linear, shift)
+            model[:, :, 4] = (p @ slope)[:, None] * q
+            weighted = (weight[:, None, None] * model).reshape(-1, 5)
+            rows = model.reshape(-1, 5)
+            normal, right = weighted.T @ rows + _NO_BEND, weighted.T @ q.ravel()
+            found: Floats = np.asarray(np.linalg.solve(normal, right), np.float64)
+            bent = float(np.clip(found[4], 0.0, _MOST_BEND / (2.0 * self.centre[0]) ** 2))
+            if bent != found[4]:
+                found = np.append(np.linalg.solve(normal[:4, :4], right[:4] - normal[:4, 4] * bent), bent)
+            misfit = np.square(q - model @ found).sum(axis=1)
+            weight = 1.0 / (1.0 + misfit / (4.0 * max(middle(misfit), 0.04)))
+            linear, shift = np.array([[found[0], -found[1]], [found[1], found[0]]]), found[2:4]
+        matrix = np.column_stack([linear, shift + self.centre - linear @ self.centre])
+        motion = replace(self, matrix=matrix, bend=found[4] * np.linalg.solve(linear, shift))
+        return replace(motion, residuals=moved - motion._base(self.points))
 
 
 STILL = Motion(np.eye(2, 3), np.zeros((0, 2)), np.zeros((0, 2)), False, 0.0)
@@ -105,12 +163,17 @@ class SceneMotion:
     def __init__(self, size: tuple[int, int]) -> None:
         self._scale = max(1.0, size[0] / _WORKING_WIDTH)
         self._size = (round(size[0] / self._scale), round(size[1] / self._scale))
+        self._full = np.array(size, dtype=np.float64)
         self._gray: Gray | None = None
         self._burnt_in = BurntIn(self._size)
         self.photometric = PhotometricGain(1)
         self._last, self._followed = np.eye(2, 3), True
         self.reach = _REACH * size[0]
         """Distance over which parallax is taken to be alike [px]."""
+
+    def beyond(self, place: Floats) -> float:
+        """Distance of a place (2,) from the image [px]."""
+        return float(np.hypot(*(place - np.clip(place, 0.0, self._full - 1.0))))
 
     def update(self, image: Image, excluded: Floats | None) -> Motion:
         """The motion since the last image. excluded: x0, y0, x1, y1 of the moving target in the last image [px]."""
@@ -232,7 +295,8 @@ class SceneMotion:
         trusted = bool(enough and 1.0 / _MOST_ZOOM < zoom < _MOST_ZOOM)
         full = self._to_full(np.asarray(matrix, np.float64))
         points = self._scale * (old[near] + 0.5) - 0.5
-        return Motion(full, points, self._scale * residual[near], trusted, share)
+        centre = 0.5 * (self._scale * np.array(self._size, dtype=np.float64) - 1.0)
+        return Motion(full, points, self._scale * residual[near], trusted, share, centre)
 
     def _are_spread(self, points: Floats) -> bool:
         """Whether points (n, 2) [px of the working image] lie at several places, not on what moves alone."""
