@@ -14,6 +14,7 @@ from protocols.geometry.types import Floats
 _EARTH_RADIUS_M = 6_378_137.0  # semi-major axis of the WGS 84 ellipsoid
 _ECCENTRICITY2 = 6.694379990141317e-3  # squared, of the WGS 84 ellipsoid
 _POSITION_GAP_S = 3.0  # greatest interval over which positions are interpolated
+_POSITION_REACH_S = 0.5  # beyond the first and the last one
 _ACCELERATION_STD_M_S2 = 10.0
 """Of a vehicle that manoeuvres. Beside positions at 1 Hz, of one that braked at 1, 2 and 4 g, the errors of a target's
 place were up to 0.9, 1.6 and 2.4 of its stds."""
@@ -22,7 +23,8 @@ place were up to 0.9, 1.6 and 2.4 of its stds."""
 def position_std(since: Floats | float, until: Floats | float) -> Any:
     """Std [m], one coordinate, of a position interpolated between reports, or extrapolated at the speed of one.
 
-    since, until: times [s] to the reports before and after it; to the one report both.
+    since, until: times [s] to the reports before and after it; to the one report both. To the two reports whose
+    difference is that speed, where it is not reported.
     """
     return 0.5 * _ACCELERATION_STD_M_S2 * np.abs(since * until)
 
@@ -38,12 +40,20 @@ def interpolate_positions(positions: list[tuple[float, Floats]], times: Floats) 
         return out, std
     known = np.array([moment for moment, _ in ordered])
     table = np.array([position for _, position in ordered])
-    index = np.clip(np.searchsorted(known, times) - 1, 0, len(known) - 2)
-    gap = known[index + 1] - known[index]
-    near = (gap <= _POSITION_GAP_S) & (times >= known[0] - 0.5) & (times <= known[-1] + 0.5)
-    share = (times - known[index]) / np.maximum(gap, 1e-9)
-    out[near] = (table[index] + share[:, None] * (table[index + 1] - table[index]))[near]
-    return out, position_std(times - known[index], known[index + 1] - times)
+    after = np.clip(np.searchsorted(known, times), 1, len(known) - 1)
+    before = after - 1
+    # Beyond the ends at the speed over half a second, not at that between two reports that may be hardly apart.
+    reach, last = np.array([_POSITION_REACH_S, _POSITION_GAP_S]), len(known) - 1
+    half, whole = np.searchsorted(known, known[-1] - reach, side="right") - [1, 0]
+    before[times > known[-1]] = np.clip(half, whole, last - 1)
+    half, whole = np.searchsorted(known, known[0] + reach) - [0, 1]
+    after[times < known[0]] = np.clip(half, 1, whole)
+    gap = known[after] - known[before]
+    near = (gap > 0.0) & (gap <= _POSITION_GAP_S)
+    near &= (times >= known[0] - _POSITION_REACH_S) & (times <= known[-1] + _POSITION_REACH_S)
+    share = (times - known[before]) / np.maximum(gap, 1e-9)
+    out[near] = (table[before] + share[:, None] * (table[after] - table[before]))[near]
+    return out, np.where(near, position_std(times - known[before], known[after] - times), 0.0)
 
 
 def rotation_from_euler(roll: float, pitch: float, yaw: float) -> Floats:

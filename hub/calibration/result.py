@@ -144,11 +144,12 @@ def assemble_calibration(
         cov.clock_rate_std(covariance, state, i, reference) if problem.free_parameters.clock and i != reference else 0.0
         for i in range(len(names))
     ]
+    roundings = [_rounding_std([rows.stamps for rows in problem.of_camera(i)]) for i in range(len(names))]
     # Of the maps onto the reference camera's clock, in the middle of their common span.
     lag_stds = [
         float(
             np.hypot(
-                _with_correction_errors(std / base.rate, problem, state, i, reference),
+                _with_correction_errors(std / base.rate, problem, state, roundings, i, reference),
                 rate_stds[i] * (lag_times[i] - middle_times[i]),
             )
         )
@@ -162,7 +163,7 @@ def assemble_calibration(
             intrinsics=state.cameras[i].intrinsics,
             pose=state.cameras[i].pose,
             time_map=maps[i],
-            time_offset_std=_time_map_std(problem, state, covariance, i, reference) / time_scales[reference],
+            time_offset_std=_time_map_std(problem, state, covariance, roundings, i, reference) / time_scales[reference],
             position_std=cov.position_std(covariance, i)
             if solution.known is None
             else solution.known.cameras[name].position_std,
@@ -173,7 +174,7 @@ def assemble_calibration(
             readout_std=float(readout_stds[i]) / time_scales[i],
             lag_time=float(lag_times[i]) / time_scales[i] + time_origins[i],
             lag_std=lag_stds[i] / time_scales[reference],
-            clock_rate_std=_with_correction_errors(rate_stds[i], problem, state, i, reference, derivative=1),
+            clock_rate_std=_with_correction_errors(rate_stds[i], problem, state, roundings, i, reference, derivative=1),
             sensitivities=effects[i],
             clock_steps=tuple(
                 (step.time / time_scales[i] + time_origins[i], step.size / time_scales[i], step.std / time_scales[i])
@@ -294,27 +295,43 @@ def _detector_z(prepared: PreparedSession, name: str, sigma: float) -> float:
     return sigma / stated if stated > 0.0 else 0.0
 
 
+_Roundings = list[tuple[float, float]]
+
+
 def _time_map_std(
-    problem: Problem, state: AdjustmentState, covariance: cov.Covariance, camera: int, reference: int
+    problem: Problem,
+    state: AdjustmentState,
+    covariance: cov.Covariance,
+    roundings: _Roundings,
+    camera: int,
+    reference: int,
 ) -> float:
     if not problem.free_parameters.clock:
         return 0.0
     return _with_correction_errors(
-        cov.time_map_std(covariance, state, camera, reference), problem, state, camera, reference
+        cov.time_map_std(covariance, state, camera, reference), problem, state, roundings, camera, reference
     )
 
 
 def _with_correction_errors(
-    std: float, problem: Problem, state: AdjustmentState, camera: int, reference: int, derivative: int = 0
+    std: float,
+    problem: Problem,
+    state: AdjustmentState,
+    roundings: _Roundings,
+    camera: int,
+    reference: int,
+    derivative: int = 0,
 ) -> float:
-    """The std of a map, or of its rate (derivative 1), with that of both clocks' steps and wander; a reference: 0."""
-    if camera == reference:
+    """The std of a map, or of its rate (derivative 1), with that of both clocks' roundings, steps and wander.
+
+    Of the reference, and of clocks that are shared: 0.
+    """
+    if camera == reference or not problem.free_parameters.clock:
         return 0.0
     variance = std**2 + sum(
         (one.rate_std if derivative else one.std) ** 2 for one in state.wanders if one.camera in (camera, reference)
     )
-    for one in (camera, reference):
-        variance += _rounding_std(np.concatenate([rows.stamps for rows in problem.of_camera(one)]))[derivative] ** 2
+    variance += sum(roundings[one][derivative] ** 2 for one in (camera, reference))
     for step in state.clock_steps:
         if step.camera in (camera, reference):  # its size moves the line through all rows as it moves those beyond it
             times = np.concatenate([rows.time[rows.use] for rows in problem.of_camera(step.camera)])
@@ -323,18 +340,23 @@ def _with_correction_errors(
     return float(np.sqrt(variance))
 
 
-def _rounding_std(stamps: Floats) -> tuple[float, float]:
+def _rounding_std(stamps: list[Floats]) -> tuple[float, float]:
     """Stds of an even clock's offset [s] and rate by how its stamps [s] are rounded: 0 where they are not.
 
     At 30 frames a second and 10 ms each third error is the same, and their mean is anything up to a sixth of 10 ms.
     """
-    times = np.unique(stamps)
+    times = np.unique(np.concatenate([np.zeros(0), *stamps]))
     gaps = np.diff(times)
-    unit = 1e-6 * float(np.gcd.reduce(np.rint(1e6 * gaps).astype(np.int64))) if len(gaps) > 1 else 0.0
+    if len(gaps) < 2:
+        return 0.0, 0.0
+    consecutive = gaps[gaps < 1.5 * np.quantile(gaps, _SHORT_GAPS)]
+    unit = 1e-6 * float(np.gcd.reduce(np.rint(1e6 * consecutive).astype(np.int64)))
     if unit < _LEAST_ROUNDING_S:
         return 0.0, 0.0
-    frame = np.r_[0.0, np.cumsum(np.rint(gaps / np.mean(gaps[gaps < 1.5 * np.median(gaps)])))]
-    error = times - np.polynomial.Polynomial.fit(frame, times, 1)(frame)
+    frame = np.r_[0.0, np.cumsum(np.rint(gaps / np.mean(consecutive)))]
+    # The usual interval of a frame, over a quarter of them, and spread of a part: a step or a pause is in few of them.
+    far = len(times) // 4 + 1
+    error = times - frame * float(np.median((times[far:] - times[:-far]) / (frame[far:] - frame[:-far])))
     parts = np.array_split(error, max(1, len(error) // _ROUNDING_FRAMES))
     spread = float(np.median([np.ptp(part) for part in parts]))
     if not 0.01 * unit < spread < unit:  # even stamps, or those of an uneven clock

@@ -153,6 +153,7 @@ class LocalFrame:
         self.position: tuple[float, Floats, Floats] | None = None
         self._shift = np.zeros(3)  # from reported local positions into this frame
         self._local_s: float | None = None
+        self._baseline_s = 0.0  # over which the velocity is a difference of positions
         self._interval_s = MAX_POSITION_AGE_S  # between reports, as a moving mean
         self._armed_s: float | None = None
 
@@ -178,7 +179,7 @@ class LocalFrame:
         age = 0.0 if self.position is None else abs(time - self.position[0])
         if known is None or age >= max(2.0 * self._interval_s, _SMOOTH_S):
             return None, 0.0
-        return known[0], float(position_std(age, age))
+        return known[0], float(position_std(age, age + self._baseline_s))
 
     def take_local(self, report: LocalPosition, time: float) -> None:
         """Add a local position. A jump that its velocity does not explain is one of its frame, until a global one."""
@@ -206,17 +207,18 @@ class LocalFrame:
             self.origin = replace(self.origin, altitude=home)
         position = self.origin.to_ned(report.latitude, report.longitude, report.altitude)
         if local is None:
-            last, velocity = self.position, report.velocity
+            last, velocity, baseline_s = self.position, report.velocity, 0.0
             if last is not None and not velocity.any() and 0.0 < time - last[0] < 2 * MAX_POSITION_AGE_S:
-                velocity = (position - last[1]) / (time - last[0])  # Betaflight sends 0 in place of it
-            self._report(time, position, velocity)
+                baseline_s = time - last[0]
+                velocity = (position - last[1]) / baseline_s  # Betaflight sends 0 in place of it
+            self._report(time, position, velocity, baseline_s)
         else:
             self._correct(position - local[0], 0.0)
 
-    def _report(self, time: float, position: Floats, velocity: Floats) -> None:
+    def _report(self, time: float, position: Floats, velocity: Floats, baseline_s: float = 0.0) -> None:
         if self.position is not None:
             self._interval_s += 0.3 * (min(time - self.position[0], MAX_POSITION_AGE_S) - self._interval_s)
-        self.position = time, position, velocity
+        self.position, self._baseline_s = (time, position, velocity), baseline_s
 
     def _correct(self, lacking: Floats, slack_m: float, *, across: bool = True) -> None:
         """Move the frame by what its positions lack (3,) [m], if that is a step of the frame. across: also sideways."""

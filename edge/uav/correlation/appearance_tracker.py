@@ -50,9 +50,6 @@ _STANDS = -0.3  # log likelihood ratio below which a place stands and the target
 _WINDOW = 1.2  # half of the region that the filter sees, in target lengths
 _MOST_OF_SCENE = 0.7  # share of the tracks that overrules another tracker
 _UNKNOWN_STEP = 0.1  # std of a step of the scene that could not be measured, over the image's width
-# Drift of the chained motion of a place that is out of the image, over its distance from it [1/s]: rms of 21 rendered
-# flights that follow a target they do not see, 0.9 to 7 s long. It goes on in one direction: it is unseen parallax.
-_UNSEEN_DRIFT = 0.08
 _FAST_PAN_S = 1.0  # in which a step in the image may be the camera's; over plain water or sky it is the target's
 _MOVES = 0.3  # speed over the scene at which a heading is given, in target lengths a second
 _MAX_GROWTH = 8.0  # of a side since the first frame
@@ -181,7 +178,6 @@ class AppearanceTracker:
             origin, sure = motion.at(box.centre, self._scene.reach), sure.at(motion.at(sure.centre, self._scene.reach))
             for moving in (self._motion_filter, velocity):
                 moving.follow_scene(motion.matrix[:, :2])
-                moving.drift(_UNSEEN_DRIFT * dt * self._scene.beyond(box.centre))
             box, sure = motion.moved(box), motion.moved(sure)
             self._redetection.move(motion, self._scene.reach, dt)
         elif expected is None and (self._missed or self._time - self._trusted_at < _FAST_PAN_S):

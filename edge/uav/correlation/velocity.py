@@ -47,10 +47,6 @@ class VelocityFilter:
         """The motion of the scene is unknown in one frame: std of it, one coordinate [px]."""
         self._scene += std**2
 
-    def drift(self, std: float) -> None:
-        """As ``lose_scene``, of an error that goes on in the same direction from frame to frame."""
-        self._scene = (np.sqrt(self._scene) + std) ** 2
-
     def turn(self, angle: float) -> None:
         """Turn the velocity by ``angle`` [rad]."""
         c, s = np.cos(angle), np.sin(angle)

@@ -163,17 +163,12 @@ class SceneMotion:
     def __init__(self, size: tuple[int, int]) -> None:
         self._scale = max(1.0, size[0] / _WORKING_WIDTH)
         self._size = (round(size[0] / self._scale), round(size[1] / self._scale))
-        self._full = np.array(size, dtype=np.float64)
         self._gray: Gray | None = None
         self._burnt_in = BurntIn(self._size)
         self.photometric = PhotometricGain(1)
         self._last, self._followed = np.eye(2, 3), True
         self.reach = _REACH * size[0]
         """Distance over which parallax is taken to be alike [px]."""
-
-    def beyond(self, place: Floats) -> float:
-        """Distance of a place (2,) from the image [px]."""
-        return float(np.hypot(*(place - np.clip(place, 0.0, self._full - 1.0))))
 
     def update(self, image: Image, excluded: Floats | None) -> Motion:
         """The motion since the last image. excluded: x0, y0, x1, y1 of the moving target in the last image [px]."""
