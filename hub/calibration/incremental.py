@@ -104,10 +104,12 @@ def update_calibration(
     given = rig, observations, last, full
     observations, last, (prepared, reconstruction), steps = _with_clock_steps(*given)
     move = moved_camera(prepared, reconstruction)
-    if move is not None and any(camera.clock_steps != steps.get(name, ()) for name, camera in given[2].cameras.items()):
+    if any(camera.clock_steps != steps.get(name, ()) for name, camera in given[2].cameras.items()):
         # A step explains a part of a move, while of what a step leaves two poses explain nothing.
-        observations, last, (prepared, reconstruction), steps = _with_clock_steps(*given, further=False)
-        move = moved_camera(prepared, reconstruction)
+        with_known = _with_clock_steps(*given, further=False)
+        moved_with_known = moved_camera(*with_known[2])
+        if move is not None or moved_with_known is not None:
+            (observations, last, (prepared, reconstruction), steps), move = with_known, moved_with_known
     origins = prepared.time_origins
     moved = {} if move is None else {move[0]: move[1][1] / prepared.time_scale(move[0]) + origins[move[0]]}
     if moved:

@@ -175,6 +175,19 @@ def test_a_moved_camera_is_found_again_where_it_stands(shift_m: float, turn_rad:
     assert abs(float(before.reference_from_camera(at)) - float(after.reference_from_camera(at))) < 3e-3
 
 
+@pytest.mark.parametrize(("seed", "degrees", "seen_s"), [(2, 1.0, 25.0), (3, 3.0, 26.5), (4, 3.0, 25.0)])
+def test_of_cameras_of_different_rates_the_fastest_is_named_where_it_was_moved(
+    seed: int, degrees: float, seen_s: float
+) -> None:
+    """The path follows it: others were named, or nobody, or a clock step, and the world was turned for good."""
+    session = simulate(seed, 4, 30, fps=(30, 24, 60, 12.5), windows=[(0, 30)] * 4)
+    last = update_calibration(session.rig, until(session, 21.0), None).calibration
+    turned = session.turned("cam2", 22.0, np.radians(degrees))
+    update = update_calibration(session.rig, until(turned, seen_s), last, full=False)
+    assert list(update.moved) == ["cam2"]
+    assert turned.turn_error({name: camera.pose for name, camera in update.calibration.cameras.items()}) < 0.01
+
+
 def test_where_the_path_follows_one_camera_alone_there_is_no_clock_step() -> None:
     """What rounding left of the information of such a step made it 1e19 s, and the solver failed for a minute."""
     session = simulate(43, 4, 50, fps=(28, 34, 17, 43), fastest=0.4, windows=[(0, 50), (0, 43), (0, 50), (0, 50)])
