@@ -444,7 +444,9 @@ class LiveHub:
             return []
         rig = self.session[0]
         ends = {name for one in rig.distances for name in one[:2]}
-        return sorted(one for one in self._moved.keys() & rig.cameras.keys() if one in ends or rig.cameras[one].pose_table())
+        return sorted(
+            one for one in self._moved.keys() & rig.cameras.keys() if one in ends or rig.cameras[one].pose_table()
+        )
 
     def offset_stds(self) -> dict[str, float]:
         """Standard deviation [s] of each calibrated camera's time offset."""

@@ -107,19 +107,33 @@ def moved_camera(
         return None
     changes = {name: _cost_change(_costs(reconstruction, name)) for name in reconstruction.names}
     if max(changes.values()) >= _LEAST_PX**2:
-        rows = {name: sum(len(part.time) for part in prepared.rows[name]) for name in changes}
-        suspects = {
-            *sorted(changes, key=lambda name: -changes[name])[:_SUSPECTS],
-            *sorted(rows, key=lambda name: -rows[name])[:_SUSPECTS],
-        }
-        rest = {name: found for name in suspects if (found := _without(prepared, reconstruction, name)) is not None}
-        left = {name: np.mean([_costs(one, other).mean() for other in one.names]) for name, one in rest.items()}
-        likely = min(left, key=lambda name: left[name], default=None)
-        found = None if likely is None else _division(prepared, reconstruction, likely, rest[likely])
+        likely = _best_without(prepared, reconstruction, changes)
+        found = None if likely is None else _division(prepared, reconstruction, *likely)
         if likely is not None and found is not None:
-            return likely, found
+            return likely[0], found
     divided = {name: _division(prepared, reconstruction, name, reconstruction) for name in reconstruction.names}
     return max(((name, one) for name, one in divided.items() if one), key=lambda one: one[1], default=None)
+
+
+def _best_without(
+    prepared: PreparedSession, reconstruction: Reconstruction, changes: Mapping[str, float]
+) -> tuple[str, Reconstruction] | None:
+    """The camera without which the others fit best, and the reconstruction of those; None where none can be left out.
+
+    A camera fits by how much more it costs than in the best of all these reconstructions: with many false detections it
+    costs most, wherever it stands. changes: by how much each camera's cost changes [px²].
+    """
+    rows = {name: sum(len(part.time) for part in prepared.rows[name]) for name in changes}
+    suspects = {name: None for by in (changes, rows) for name in sorted(by, key=by.__getitem__)[-_SUSPECTS:]}
+    rest = {name: found for name in suspects if (found := _without(prepared, reconstruction, name)) is not None}
+    costs = {
+        left_out: {name: float(_costs(one, name).mean()) for name in one.names}
+        for left_out, one in (("", reconstruction), *rest.items())
+    }
+    least = {name: min(one[name] for one in costs.values() if name in one) for name in changes}
+    excess = {name: sum(cost - least[other] for other, cost in costs[name].items()) for name in rest}
+    best = min(excess, key=excess.__getitem__, default=None)
+    return None if best is None else (best, rest[best])
 
 
 def _costs(reconstruction: Reconstruction, name: str) -> Floats:
