@@ -56,7 +56,7 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     if not problem.free_parameters.clock:
         return None
     best = max(likely_clock_steps(problem, state) or (), key=lambda one: one.statistic, default=None)
-    if best is None or best.statistic <= needed_for_a_step(problem) or abs(best.size) <= _MIN_STEP_S:
+    if best is None or best.statistic <= needed_for_a_step(problem) or not _MIN_STEP_S < abs(best.size) <= MAX_STEP_S:
         return _step_of_rejected_rows(problem, state)
     return best
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -61,6 +62,11 @@ _WAITS = "waits for the next search of its lag"
 _BETTER_KNOWN = 0.7  # a clock step is refined where its std falls below this share: twice the rows
 
 
+_Start: TypeAlias = tuple[
+    Observations, Calibration, tuple[PreparedSession, Reconstruction], dict[str, tuple[Step, ...]]
+]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Update:
     """An answer, and cameras that were moved: by name, camera time [s] from which on the new pose holds.
@@ -101,13 +107,8 @@ def update_calibration(
     if since := _since_a_move_of_two(rig, observations, last, full):
         again = partial(update_calibration, rig, search=search, full=full, refine_lenses=refine_lenses)
         return _from_newest_side(*since, partial(again, clock_priors=clock_priors, arrivals=arrivals))
-    given = rig, observations, last, full
-    observations, last, (prepared, reconstruction), steps = _with_clock_steps(*given)
-    move = moved_camera(prepared, reconstruction)
-    if move is not None and any(camera.clock_steps != steps.get(name, ()) for name, camera in given[2].cameras.items()):
-        # A step explains a part of a move, while of what a step leaves two poses explain nothing.
-        observations, last, (prepared, reconstruction), steps = _with_clock_steps(*given, further=False)
-        move = moved_camera(prepared, reconstruction)
+    start, move = _start_and_move(rig, observations, last, full)
+    observations, last, (prepared, reconstruction), steps = start
     origins = prepared.time_origins
     moved = {} if move is None else {move[0]: move[1][1] / prepared.time_scale(move[0]) + origins[move[0]]}
     if moved:
@@ -291,9 +292,26 @@ def _after_move(prepared: PreparedSession, last: Calibration, names: list[str], 
     return replace(last, cameras=cameras, trajectories=())
 
 
+def _start_and_move(
+    rig: Rig, observations: Observations, last: Calibration, full: bool
+) -> tuple[_Start, tuple[str, tuple[float, float, float]] | None]:
+    """As `_with_clock_steps`, and the camera that was moved since, as `moved_camera` gives it.
+
+    A step explains a part of a move, while of what a step leaves two poses explain nothing: of both it is a move.
+    """
+    start = _with_clock_steps(rig, observations, last, full)
+    move, steps = moved_camera(*start[2]), start[3]
+    if any(camera.clock_steps != steps.get(name, ()) for name, camera in last.cameras.items()):
+        before = _with_clock_steps(rig, observations, last, full, further=False)
+        moved_before = moved_camera(*before[2])
+        if move is not None or moved_before is not None:
+            return before, moved_before
+    return start, move
+
+
 def _with_clock_steps(
     rig: Rig, observations: Observations, last: Calibration, full: bool, further: bool = True
-) -> tuple[Observations, Calibration, tuple[PreparedSession, Reconstruction], dict[str, tuple[Step, ...]]]:
+) -> _Start:
     """Observations on the newest side of all clock steps, the last answer on it, the start from both, and the steps.
 
     Steps that are known are corrected; ``further`` ones are, where they explain the rows better.

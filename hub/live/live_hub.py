@@ -59,6 +59,8 @@ _CHECK_EVERY_S, _CHECK_LOAD, _CHECKED_S = 20.0, 0.5, 60.0
 rows that each is by: a camera that was moved is named once they are more than those before."""
 _BUDGET_NOTICE_S = 10.0
 """How long the status names a camera that exceeded its budget."""
+_MOVED_NOTICE_S = 600.0
+"""How long the status names a camera that was moved [s]: until somebody who comes by has read it."""
 _UNSEEN = "pose and clock are of an earlier answer, no detections since"
 _OTHER_CLOCK = "restarted and not located since"
 _RESTARTED = f"{_OTHER_CLOCK}: pose and clock are of an earlier answer, before the restart"
@@ -155,8 +157,8 @@ class LiveHub:
         self._solved_boot_ids: dict[str, str] = {}
         self._restarted: dict[str, CameraCalibration] = {}
         """By camera whose clock is another one since, until it is located again: as it was before."""
-        self._moved = set[str]()
-        """Cameras that were moved since they were first located."""
+        self._moved = dict[str, float]()
+        """Cameras that were moved since they were first located, and when that was last found [s]."""
         self._rig_cameras: dict[str, RigCamera] = {}
         """Of all answers so far, the reloaded one included."""
         self._reloaded: ReloadedCalibration | None = None
@@ -228,7 +230,7 @@ class LiveHub:
             self.stream.release(name)
             self.links.last_frame.pop(name, None)
             self._restarted.pop(name, None)
-            self._moved.discard(name)
+            self._moved.pop(name, None)
             self._rig_cameras.pop(name, None)
         if self.calibration is not None:
             kept = {name: one for name, one in self.calibration.cameras.items() if name not in cameras}
@@ -402,7 +404,8 @@ class LiveHub:
         """What the hub does at ``now``, and one line for a person."""
         reasons = self.degradations(now)
         if self.calibration is not None:
-            count = f"{len(self.calibration.cameras)} cameras calibrated"
+            cameras = self.calibration.cameras
+            count = f"{len(cameras)} cameras calibrated{self._moved_lately(cameras, now)}"
             return ("degraded", "; ".join([*reasons, count])) if reasons else ("calibrated", count)
         if missing := self.missing():
             return "collecting", "; ".join([*reasons, missing])
@@ -428,13 +431,22 @@ class LiveHub:
         present, boots = self._in_present_segments(self.calibration)[1], self.links.boots
         return sorted(name for name, boot in present.items() if boots.get(name, boot) != boot)
 
+    def _moved_lately(self, cameras: Collection[str], now: float) -> str:
+        """Which of the calibrated cameras were found to have been moved in the last minutes, for the status; or ""."""
+        ages = {name: now - found for name, found in sorted(self._moved.items()) if now - found < _MOVED_NOTICE_S}
+        if len(ages) == len(cameras) == 2:  # it does not show which one
+            return f", one of them moved {min(ages.values()):.0f} s ago"
+        return f", moved: {listed(f'{name} ({age:.0f} s ago)' for name, age in ages.items())}" if ages else ""
+
     def _moved_from_references(self) -> list[str]:
         """Cameras that were moved, with a position, a rotation or a distance that was measured before."""
         if self.session is None:
             return []
         rig = self.session[0]
         ends = {name for one in rig.distances for name in one[:2]}
-        return sorted(one for one in self._moved & rig.cameras.keys() if one in ends or rig.cameras[one].pose_table())
+        return sorted(
+            one for one in self._moved.keys() & rig.cameras.keys() if one in ends or rig.cameras[one].pose_table()
+        )
 
     def offset_stds(self) -> dict[str, float]:
         """Standard deviation [s] of each calibrated camera's time offset."""
@@ -708,7 +720,7 @@ class LiveHub:
         found = answer.calibration
         for name, since in answer.moved.items():
             self.counters["moved"] += 1
-            self._moved.add(name)
+            self._moved[name] = now
             self.stream.marker.forget_before(name, since)
         observations = job.observations if answer.observations is None else answer.observations
         rows = len(observations)

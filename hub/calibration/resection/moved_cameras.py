@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hub.bundle.initialisation import CameraInput, Reconstruction
+from hub.bundle.initialisation import CameraInput, Reconstruction, triangulate_and_adjust
 from hub.bundle.preprocessing import PreparedSession
+from hub.bundle.residuals import residual_norms
 from hub.calibration.resection.scan import (
     LIKELY_CANDIDATES,
     MIN_CANDIDATE_RATIO,
@@ -30,6 +31,7 @@ from hub.calibration.resection.scan import (
     verify,
 )
 from hub.calibration.solvers import Solution
+from protocols.core.errors import Refused
 from protocols.geometry.types import Floats
 from protocols.session.observations import Observations
 
@@ -43,6 +45,9 @@ _LEAST_S = 1.0  # on each side of a move: half a second of a path gave a pose th
 LEAST_ROWS, _MOST_ROWS = 30, 400
 """Rows of a camera on each side of a move, as many as a camera of a network needs; of all, and of the ends, about as
 many are used, at most twice."""
+_SUSPECTS = 4
+"""Of a network, cameras without which the others are tried: whose costs change most, and those with most rows, whose
+own may change least, as the path follows them."""
 _END_S = 4.0
 """Of the ends more rows are used, each counting less: of 150 s evenly spaced, those of a side lasted 4 to 7 s."""
 _MARGIN_S = 0.3
@@ -93,19 +98,85 @@ def moved_camera(
     prepared: PreparedSession, reconstruction: Reconstruction
 ) -> tuple[str, tuple[float, float, float]] | None:
     """Of the placed cameras the one that most probably was moved, which distorts the path for all: its name, gain, time
-    [s] since its origin and angle [rad]. None where none was, or where fewer than two others are placed."""
-    found: dict[str, tuple[float, float, float]] = {}
-    for name, clock in zip(reconstruction.names, reconstruction.state.cameras, strict=True):
-        given, lens = prepared.cameras[name], clock.intrinsics
-        labels = seen_labels(given, reconstruction)
-        if lens is not given.intrinsics:  # it was estimated, and the tracks are in coordinates of the given one
-            rays = [lens.unproject(given.intrinsics.project_normalised(one.track.points)) for one in labels]
-            labels = [replace(one, track=replace(one.track, points=ray)) for one, ray in zip(labels, rays, strict=True)]
-        if labels and len(reconstruction.names) > 2:
-            offset = clock.offset - clock.rate * clock.centre
-            divided = _divide(labels, replace(given, intrinsics=lens), clock.rate, offset)
-            found |= {} if divided is None else {name: divided}
-    return max(found.items(), key=lambda one: one[1], default=None)
+    [s] since its origin and angle [rad]. None where none was, or where fewer than two others are placed.
+
+    It is the one without which the others fit best. The path may follow it, where it has the most frames, and then the
+    others seem to have been moved: of two of those, one that was moved before fits the path of those left no better.
+    """
+    if len(reconstruction.names) < 3:
+        return None
+    changes = {name: _cost_change(_costs(reconstruction, name)) for name in reconstruction.names}
+    if max(changes.values()) >= _LEAST_PX**2:
+        likely = _best_without(prepared, reconstruction, changes)
+        found = None if likely is None else _division(prepared, reconstruction, *likely)
+        if likely is not None and found is not None:
+            return likely[0], found
+    divided = {name: _division(prepared, reconstruction, name, reconstruction) for name in reconstruction.names}
+    return max(((name, one) for name, one in divided.items() if one), key=lambda one: one[1], default=None)
+
+
+def _best_without(
+    prepared: PreparedSession, reconstruction: Reconstruction, changes: Mapping[str, float]
+) -> tuple[str, Reconstruction] | None:
+    """The camera without which the others fit best, and the reconstruction of those; None where none can be left out.
+
+    A camera fits by how much more it costs than in the best of all these reconstructions: with many false detections it
+    costs most, wherever it stands. changes: by how much each camera's cost changes [px²].
+    """
+    rows = {name: sum(len(part.time) for part in prepared.rows[name]) for name in changes}
+    suspects = {name: None for by in (changes, rows) for name in sorted(by, key=by.__getitem__)[-_SUSPECTS:]}
+    rest = {name: found for name in suspects if (found := _without(prepared, reconstruction, name)) is not None}
+    costs = {
+        left_out: {name: float(_costs(one, name).mean()) for name in one.names}
+        for left_out, one in (("", reconstruction), *rest.items())
+    }
+    least = {name: min(one[name] for one in costs.values() if name in one) for name in changes}
+    excess = {name: sum(cost - least[other] for other, cost in costs[name].items()) for name in rest}
+    best = min(excess, key=excess.__getitem__, default=None)
+    return None if best is None else (best, rest[best])
+
+
+def _costs(reconstruction: Reconstruction, name: str) -> Floats:
+    """What a camera's rows (n,) on the paths cost [px²], in the order of their times; rejected ones count."""
+    number, paths = reconstruction.names.index(name), reconstruction.state.trajectories
+    parts = reconstruction.problem.of_camera(number)
+    times = np.concatenate([np.zeros(0), *(part.time for part in parts)])
+    norms = (residual_norms(part, reconstruction.state.cameras[number], paths[part.label]) for part in parts)
+    costs = np.minimum(np.concatenate([np.zeros(0), *norms])[np.argsort(times, kind="stable")], TRUNCATION_PX) ** 2
+    known = ~np.isnan(costs)
+    return costs[known] if known.any() else np.full(1, TRUNCATION_PX**2)
+
+
+def _cost_change(costs: Floats) -> float:
+    """By how much the mean of a camera's costs changes [px²] where it changes most."""
+    at = int(likely_division(costs) * len(costs))
+    return abs(float(costs[:at].mean() - costs[at:].mean())) if LEAST_ROWS <= at <= len(costs) - LEAST_ROWS else 0.0
+
+
+def _without(prepared: PreparedSession, reconstruction: Reconstruction, name: str) -> Reconstruction | None:
+    """The reconstruction of the other placed cameras, adjusted without one; None where they see no path."""
+    placed = dict(zip(reconstruction.names, reconstruction.state.cameras, strict=True))
+    del placed[name]
+    cameras = {other: prepared.cameras[other] for other in prepared.cameras if other in placed}
+    first, second, *_ = cameras
+    free = reconstruction.problem.free_parameters
+    try:
+        return triangulate_and_adjust(cameras, placed, prepared.rows, prepared.labels, (first, second), free)
+    except Refused:
+        return None
+
+
+def _division(
+    prepared: PreparedSession, reconstruction: Reconstruction, name: str, paths: Reconstruction
+) -> tuple[float, float, float] | None:
+    """As `_divide`: of a placed camera, against the paths of a reconstruction with or without it."""
+    given, clock = prepared.cameras[name], reconstruction.state.cameras[reconstruction.names.index(name)]
+    lens, labels = clock.intrinsics, seen_labels(given, paths)
+    if lens is not given.intrinsics:  # it was estimated, and the tracks are in coordinates of the given one
+        rays = [lens.unproject(given.intrinsics.project_normalised(one.track.points)) for one in labels]
+        labels = [replace(one, track=replace(one.track, points=ray)) for one, ray in zip(labels, rays, strict=True)]
+    offset = clock.offset - clock.rate * clock.centre
+    return _divide(labels, replace(given, intrinsics=lens), clock.rate, offset) if labels else None
 
 
 def without_moved(observations: Observations, moves: Mapping[str, Move]) -> Observations:

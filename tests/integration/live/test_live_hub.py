@@ -206,6 +206,8 @@ def test_a_moved_camera_is_named_where_it_was_measured_before() -> None:
     state, reason = hub.state(1e6)
     assert state == "degraded"
     assert "cam1: moved from where the rig's references say" in reason
+    assert reason.endswith("4 cameras calibrated"), "who comes days later reads what is wrong then"
+    assert "4 cameras calibrated, moved: cam1 (" in hub.state(60.0)[1]
 
 
 def test_a_camera_whose_lens_is_refuted_does_not_come_back_with_every_search() -> None:

@@ -175,6 +175,32 @@ def test_a_moved_camera_is_found_again_where_it_stands(shift_m: float, turn_rad:
     assert abs(float(before.reference_from_camera(at)) - float(after.reference_from_camera(at))) < 3e-3
 
 
+@pytest.mark.parametrize(("seed", "degrees", "seen_s"), [(2, 1.0, 25.0), (3, 3.0, 26.5), (4, 3.0, 25.0)])
+def test_of_cameras_of_different_rates_the_fastest_is_named_where_it_was_moved(
+    seed: int, degrees: float, seen_s: float
+) -> None:
+    """The path follows it: others were named, or nobody, or a clock step, and the world was turned for good."""
+    session = simulate(seed, 4, 30, fps=(30, 24, 60, 12.5), windows=[(0, 30)] * 4)
+    last = update_calibration(session.rig, until(session, 21.0), None).calibration
+    turned = session.turned("cam2", 22.0, np.radians(degrees))
+    update = update_calibration(session.rig, until(turned, seen_s), last, full=False)
+    assert list(update.moved) == ["cam2"]
+    assert turned.turn_error({name: camera.pose for name, camera in update.calibration.cameras.items()}) < 0.01
+
+
+@pytest.mark.parametrize(("seed", "name"), [(2, "cam2"), (5, "cam1")])
+def test_a_camera_with_false_detections_is_not_the_one_that_was_moved(seed: int, name: str) -> None:
+    """Without it, whose rows cost most, the others seem to fit best."""
+    session = simulate(seed, 3, 30, fps=(30, 24, 60), windows=[(0, 30)] * 3)
+    rng = np.random.default_rng(seed)
+    false = (np.array(session.camera) == "cam0") & (rng.random(len(session.time)) < 0.15)
+    pixels = np.where(false[:, None], rng.uniform(0.0, 400.0, session.pixels.shape), session.pixels)
+    session = replace(session, pixels=pixels)
+    last = update_calibration(session.rig, until(session, 24.0), None).calibration
+    turned = session.turned(name, 25.0, np.radians(2.0))
+    assert list(update_calibration(session.rig, until(turned, 28.0), last, full=False).moved) == [name]
+
+
 def test_where_the_path_follows_one_camera_alone_there_is_no_clock_step() -> None:
     """What rounding left of the information of such a step made it 1e19 s, and the solver failed for a minute."""
     session = simulate(43, 4, 50, fps=(28, 34, 17, 43), fastest=0.4, windows=[(0, 50), (0, 43), (0, 50), (0, 50)])

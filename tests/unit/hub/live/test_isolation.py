@@ -77,6 +77,22 @@ def test_frames_that_are_not_counted_are_named() -> None:
     assert text in hub.state(200 * 0.033)[1]
 
 
+def test_a_camera_that_was_restarted_under_one_boot_id_is_named() -> None:
+    """Its frames were left out as duplicates, and the hub was calibrated: for half a minute, or for good."""
+    hub = LiveHub(LiveSettings(track=False))
+    for number in range(900):
+        for camera, sent in (("a", number), ("b", number % 500)):
+            hub.handle(frame(camera, sent), number * 0.033)
+        late = frame("a", max(number - 100, 0))  # a history that comes in parts, the newest first
+        hub.handle(late, number * 0.033)
+    (text,) = hub.links.standing.values()
+    assert text.startswith("b counts its frames anew (")
+    assert text in hub.state(900 * 0.033)[1]
+    for number in range(300):
+        hub.handle(frame("b", number, boot_id="b1"), (900 + number) * 0.033)
+    assert not hub.links.standing
+
+
 def test_a_camera_that_has_not_introduced_itself_is_told_so() -> None:
     hub = LiveHub(LiveSettings(track=False))
     hub.handle(info("a"))
