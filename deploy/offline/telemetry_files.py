@@ -179,10 +179,12 @@ def check_attitudes(
     given, motion, seen = search([(recorded.samples, body_from_camera)])[0]
     correlated = given is not None and given.evidence >= given.threshold
     offset = None if given is None else accepted_offset(given, None, _MOST_STD_S)
+    found = search_offset(seen, recorded.samples, body_from_camera)
+    wider = None if isinstance(found, str) else found
     if not correlated:
-        # Before an offset is looked for in all of the telemetry, where a wrong convention can fit somewhere, too.
+        # A wrong convention can fit somewhere in all of the telemetry, too, and the right one far off.
         others = search([read(recorded.samples, body_from_camera) for read in _CONVENTIONS.values()])
-        least = 0.0 if given is None else given.evidence
+        least = max(one.evidence if one is not None else 0.0 for one in (given, wider))
         fits = {
             one.evidence: name
             for name, (one, _, _) in zip(_CONVENTIONS, others, strict=True)
@@ -192,9 +194,11 @@ def check_attitudes(
             what = f"its attitudes do not turn as the video does, but would if {fits[max(fits)]}"
             remedy = "give qw,qx,qy,qz of ned_from_body and body_from_camera; body axes are forward, right, down"
             raise InputError(what, file=file, remedy=remedy)
-    if not isinstance(offset, OffsetEstimate):
-        wider = search_offset(seen, recorded.samples, body_from_camera)
-        offset = None if isinstance(wider, str) else accepted_offset(wider, None, _MOST_STD_S)
+    if wider is not None and (
+        # A vehicle that sways shows a lower maximum each period.
+        not isinstance(offset, OffsetEstimate) or given is None or wider.evidence > given.evidence + wider.threshold
+    ):
+        offset = accepted_offset(wider, None, _MOST_STD_S)
     if isinstance(offset, OffsetEstimate):
         # The tracker finds small ones in flight, too, but its ground frame begins before.
         samples = tuple(replace(sample, time=sample.time - offset.offset) for sample in recorded.samples)
@@ -227,8 +231,11 @@ def _check_motion(motion: GroundMotion | None, file: Path) -> list[str]:
             f"{file}: its positions move along another way than the images show: check that both are of one flight and "
             "on one clock, and that the columns are north, east, down"
         ]
-    remedy = "give positions in metres, with heights above the ground and not above sea level"
-    return [f"{file}: {motion.wrong_height}: {remedy}"] if motion.wrong_height else []
+    checks = {
+        motion.wrong_heading: "check the compass, and body_from_camera in --rig",
+        motion.wrong_height: "give positions in metres, with heights above the ground and not above sea level",
+    }
+    return [f"{file}: {what}: {remedy}" for what, remedy in checks.items() if what]
 
 
 def _visual_rotations(footage: Footage, readings: list[_Reading]) -> tuple[list[RelativeRotations], float]:

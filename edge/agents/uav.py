@@ -211,8 +211,9 @@ class UavAgent:
             message += f": {reason}" if reason else ""
         elif not ended:
             contradiction = self.aligner.reason if self.aligner is not None and self._contradicted else ""
-            height = "" if self.aligner is None else self.aligner.wrong_height
-            problem = vehicle.problem(self._now_ns()) or contradiction or reason or height
+            motion = "" if self.aligner is None else self.aligner.wrong_motion
+            problem = vehicle.problem(self._now_ns()) or contradiction or reason or motion
+            problem = problem or vehicle.without_position(self._now_ns())
             state = "degraded" if contradiction or problem.startswith("no attitude") else state
             message = problem or self._guidance.hold_reason or "commands are sent"
             second = link.second_sender(self._now_ns())

@@ -8,12 +8,13 @@ compared while both see the target, and the ground is used once it has held, and
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from edge.uav.base import Basis, Box, Estimate, Telemetry, TrackState
-from edge.uav.correlation.appearance_tracker import AppearanceTracker
+from edge.uav.correlation.appearance_tracker import CENTRE_STD, AppearanceTracker
 from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.ground.photometric import Contrast
 from edge.uav.ground_tracker import GroundTracker
@@ -213,7 +214,8 @@ class AdaptiveTracker:
             return ground
         sides = self._sides * [ground.width, ground.height]
         x, y = ground.x + float(self._shift[0]), ground.y + float(self._shift[1])
-        return replace(ground, x=x, y=y, width=float(sides[0]), height=float(sides[1]))
+        std = math.hypot(ground.std, CENTRE_STD * float(np.nan_to_num(sides).max()))  # as of its box
+        return replace(ground, x=x, y=y, width=float(sides[0]), height=float(sides[1]), std=std)
 
     def _on_ground(self, estimate: Estimate) -> Estimate:
         metric = bool(np.isfinite(estimate.north)) or (self._ground is not None and self._ground.metric)

@@ -23,6 +23,7 @@ _LONGEST_GAP_S = 0.8  # between attitudes: interpolated in 0.8 s 0.27° rms off,
 _CRUISE_M_S = 10.0  # of a vehicle whose samples do not tell
 _MIN_COSINE = 0.6  # between the ray and straight down: for flatter rays a small tilt error is metres
 _ROLL_PITCH_STD_RAD = 0.005  # of an autopilot's roll and pitch
+_HEADING_STD_RAD = 0.035  # of its heading, 2 degrees: a compass, corrected for the field of currents in flight
 _MIN_HEIGHT_M = 2.0  # of the camera: below, an error of the height in metres is as large as the height
 _CAR_CENTRE_HEIGHT_M = 0.7  # above the ground: 0.155 of a car's length of 4.5 m, as the ground tracker takes it
 _CENTRE_HEIGHT_STD_M = 0.7  # of that height: a person's is 0.9 m, a boat's with its mast 2 m
@@ -41,11 +42,18 @@ def ground_point(ray: Floats, centre: Floats, least_down: float, above: float = 
     return np.asarray(centre[:2] + (height - above) / ray[2] * ray[:2])
 
 
+def _tilt_std(place: Floats, centre: Floats, tilt: float) -> float:
+    """Std [m], one coordinate, of a place (2,) seen from a centre (3,), by that of roll and pitch [rad]."""
+    height = max(-float(centre[2]), _MIN_HEIGHT_M)
+    return tilt * height * (1.0 + (float(np.hypot(*(place - centre[:2]))) / height) ** 2)
+
+
 def _ground_std(place: Floats, centre: Floats) -> float:
     """Std [m], one coordinate, of a place (2,) seen from a centre (3,), by the attitude and the target's height."""
-    height = max(-float(centre[2]), _MIN_HEIGHT_M)
-    slope = float(np.hypot(*(place - centre[:2]))) / height
-    return math.hypot(_ROLL_PITCH_STD_RAD * height * (1.0 + slope**2), _CENTRE_HEIGHT_STD_M * slope / math.sqrt(2.0))
+    distance = float(np.hypot(*(place - centre[:2])))
+    aside = _HEADING_STD_RAD * distance
+    along = _CENTRE_HEIGHT_STD_M * distance / max(-float(centre[2]), _MIN_HEIGHT_M)
+    return math.hypot(_tilt_std(place, centre, _ROLL_PITCH_STD_RAD), math.hypot(aside, along) / math.sqrt(2.0))
 
 
 class Georeference:
@@ -59,7 +67,7 @@ class Georeference:
     def __init__(self, lens: Intrinsics, body_from_camera: Floats, clock_std_s: float = 0.0) -> None:
         self._lens, self._clock_std_s = lens, clock_std_s
         self._telemetry = TelemetryTrack(np.asarray(body_from_camera), _LONGEST_GAP_S)
-        self._centre: Floats | None = None
+        self._centre: Floats | None = None  # of the newest sample, for stds where none are near
         self._frame: tuple[int, ...] | None = None
         self._known_s = self._known_std = 0.0  # since when the ground frame drifts, and its std [m] by then
         self.offset: Floats | None = None
@@ -67,10 +75,12 @@ class Georeference:
     def add(self, sample: Telemetry) -> None:
         """Add a telemetry sample."""
         self._telemetry.add(sample)
+        if sample.position is not None and np.isfinite(sample.position).all():
+            self._centre = np.asarray(sample.position, dtype=np.float64)
 
     def reset(self) -> None:
         """Start over for another target, whose ground frame is new."""
-        self.offset = self._centre = self._frame = None
+        self.offset = self._frame = None
 
     def locate(self, x: float, y: float, time: float) -> Floats | None:
         """Ground position (2,) north, east [m] of the target at a pixel; None if not observable."""
@@ -97,12 +107,11 @@ class Georeference:
             gain = 1.0 if self.offset is None else -math.expm1(-max(time - self._known_s, 0.0) / _TIME_CONSTANT_S)
             self.offset = difference if self.offset is None else self.offset + gain * (difference - self.offset)
             # Errors of one report's positions are alike: the mean of the stds, not of their squares.
-            self._known_std += gain * (self._telemetry.position_std_at(time) - self._known_std)
+            self._known_std += gain * (self._telemetry_std(measured, time) - self._known_std)
             self._known_s = time
         if self.offset is not None:
             place = place + self.offset
-        centre = self._telemetry.position_at(self._telemetry.nearest_time(time) if self._centre is None else time)
-        self._centre = centre = self._centre if centre is None else centre
+        centre = self._centre_at(time)
         drift = _DRIFT_M_S * (time - self._known_s)
         ground = 0.0 if centre is None else _ground_std(place, centre)
         std_m = math.hypot(estimate.std_m, ground, drift, self._known_std)
@@ -117,4 +126,16 @@ class Georeference:
         speed = _CRUISE_M_S
         if late > early and places[0] is not None and places[1] is not None:
             speed = float(np.hypot(*(places[1] - places[0]))) / (late - early)
-        return math.hypot(speed * off / math.sqrt(2.0), self._telemetry.position_std_at(nearest))
+        place = np.array([estimate.north, estimate.east])
+        return math.hypot(speed * off / math.sqrt(2.0), self._telemetry_std(place, nearest))
+
+    def _telemetry_std(self, place: Floats, time: float) -> float:
+        """Std [m], one coordinate, of a place (2,) by the time to the samples around."""
+        position, tilt = self._telemetry.stds_at(time)
+        centre = self._centre_at(time)
+        return math.hypot(position, 0.0 if centre is None else _tilt_std(place, centre, tilt))
+
+    def _centre_at(self, time: float) -> Floats | None:
+        """Position (3,) of the vehicle, of its newest sample where none are near."""
+        centre = self._telemetry.position_at(time)
+        return self._centre if centre is None else centre

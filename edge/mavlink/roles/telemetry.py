@@ -166,6 +166,11 @@ class LocalFrame:
         self.position = self._local_s = None
         self._shift = np.zeros(3)
 
+    @property
+    def reported_s(self) -> float:
+        """Time of the last report; −inf where there is none."""
+        return -math.inf if self.position is None else self.position[0]
+
     def at(self, time: float) -> tuple[Floats, Floats] | None:
         """Position and velocity (3,) at a time; None if not known of late."""
         if self.position is None or abs(time - self.position[0]) >= MAX_POSITION_AGE_S:

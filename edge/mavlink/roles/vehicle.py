@@ -112,6 +112,13 @@ class Vehicle:
         slow = f"attitudes come at {1.0 / self._spacing_s:.1f} Hz, too seldom for positions: ask for 4 Hz or more"
         return refused or (slow if self._spacing_s > _MAX_SPACING_S else "")
 
+    def without_position(self, now_ns: int) -> str:
+        """That no position comes, as one line; "" where it does."""
+        since = self.frame.reported_s if self._first_s is None else max(self.frame.reported_s, self._first_s)
+        if not _MISSING_AFTER_S < now_ns / NANOSECONDS - since < math.inf:
+            return ""
+        return "no position of the autopilot (GLOBAL_POSITION_INT with a fix): targets have no place on the ground"
+
     def tick(self, now_ns: int) -> None:
         """Send the TIMESYNC and rate requests that are due."""
         now = now_ns / NANOSECONDS

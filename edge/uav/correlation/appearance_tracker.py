@@ -41,7 +41,7 @@ _COLOUR_SHARE = 0.5  # of its log likelihood ratio that the similarity and the f
 _LOOK_ALIKE = 0.05  # probability that what is seen off the target is one of its kind
 _SUPPORT, _SUPPORT_WITHIN = 2.0, 0.35  # log likelihood ratio of a place at which another tracker sees it; in lengths
 _MOVED = 2.0  # distance within which what moves is looked for, in target lengths
-_CENTRE_STD = 0.04  # of a followed box about the middle of its target, in lengths: 93 % of real ones are within 2
+CENTRE_STD = 0.04  # of a followed box about the middle of its target, in lengths: 93 % of real ones are within 2
 _SLIP_STD = 0.35  # of a box that has slipped off its target, in target lengths: the two still overlap
 _STAYED = 0.3  # distance of a box from where its target has moved at first, in sides, at which it goes there
 _LIKE_FIRST = 0.65  # similarity to the first view above which a box holds its target: of what was left 0.6 or less
@@ -432,5 +432,5 @@ class AppearanceTracker:
         velocity = self._motion_filter.velocity
         moves = state is not TrackState.LOST and np.hypot(*velocity) > _MOVES * self.length
         heading = float(np.arctan2(velocity[1], velocity[0])) if moves else np.nan
-        std = self.std if self._missed else float(np.hypot(self.std, _CENTRE_STD * self.length))
+        std = self.std if self._missed else float(np.hypot(self.std, CENTRE_STD * self.length))
         return Estimate(time, state, x, y, float(extent[0]), float(extent[1]), heading, std)

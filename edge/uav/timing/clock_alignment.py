@@ -105,10 +105,10 @@ class ClockAligner:
         return self.reason.startswith(_CONTRADICTIONS)
 
     @property
-    def wrong_height(self) -> str:
-        """That the ground is at another height than that of take-off; "" where it is not."""
+    def wrong_motion(self) -> str:
+        """That heading, or height above the ground, are not those of the images; "" where they are."""
         motion = None if self.estimate is None else self.estimate.motion
-        return "" if motion is None else motion.wrong_height
+        return "" if motion is None else motion.wrong_heading or motion.wrong_height
 
     @property
     def offset_s(self) -> float:

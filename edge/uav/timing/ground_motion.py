@@ -28,6 +28,7 @@ _UNLIKE = (
 )
 _LONG_M = 2.0  # a window: a receiver's noise of 0.5 m changes the coherence of such ways by 0.1
 _MAX_TURN = 0.25 * math.pi  # nearer to another quarter turn than to none; no compass is so wrong
+_MAX_HEADING_ERROR = 0.15  # rad, 9 degrees, four stds of a heading; with clocks 0.25 s apart both ways differ by 1
 _MAX_LOG_RATIO = 0.12  # of both ways: of simulated flights with clocks 0.25 s apart it is up to 0.1
 _STANDS_STILL = 0.01  # ratio of positions in degrees, or that never change; no ground is so much nearer
 
@@ -83,6 +84,13 @@ class GroundMotion:
         return (
             f"{CONTRADICTION}, but as of a camera turned by {quarter} degrees: check body_from_camera, and the heading"
         )
+
+    @property
+    def wrong_heading(self) -> str:
+        """That the telemetry's heading is not that of the images; "" where it is."""
+        if not self.agrees_in_shape or self.contradiction or abs(self.turn) <= _MAX_HEADING_ERROR:
+            return ""
+        return f"the images move as with a heading that is wrong by {abs(math.degrees(self.turn)):.0f} degrees"
 
     @property
     def wrong_height(self) -> str:

@@ -274,6 +274,18 @@ def test_a_gimbal_that_never_reports_is_named() -> None:
     assert under_test.vehicle.problem(4_000_000_000) == "no attitude of the gimbal (GIMBAL_DEVICE_ATTITUDE_STATUS)"
 
 
+def test_an_autopilot_without_a_position_is_named() -> None:
+    """Targets had no place on the ground, and the status was that commands are off."""
+    under_test = VehicleUnderTest()
+    for k in range(40):
+        under_test.attitude(0.1 * k)
+    assert under_test.vehicle.without_position(2_000_000_000) == ""  # not asked long enough
+    assert under_test.vehicle.without_position(4_000_000_000).startswith("no position of the autopilot")
+    under_test.position(4.0)
+    assert under_test.vehicle.without_position(6_000_000_000) == ""
+    assert under_test.vehicle.without_position(8_000_000_000).startswith("no position of the autopilot")
+
+
 def test_an_autopilot_that_signs_and_answers_nothing_is_named() -> None:
     under_test = VehicleUnderTest()
     for k in range(40):

@@ -145,6 +145,24 @@ def test_a_place_out_of_the_filters_window_is_not_believed() -> None:
     assert not far.visible
 
 
+def test_a_place_that_the_ground_has_from_the_box_is_as_uncertain_as_the_box(scene: Image) -> None:
+    """In an orbit the box of a car of 65 px came to lie 8 px beside its middle, 4.1 stds of the ground."""
+    tracker = AdaptiveTracker(SIZE, fps=FPS)
+    place = np.array([120.0, 120.0])
+    tracker.begin(painted(scene, place), 0.0, Box(*(place - 0.5 * TARGET), *map(float, TARGET)))
+    tracker._trust = 1.0
+    ground = tracker._ground
+    assert ground is not None
+    visible = Estimate(1 / FPS, TrackState.VISIBLE, 118.0, 120.0, 30.0, 20.0, float("nan"), 0.1)
+    ground.handle_frame = lambda image, time: replace(visible, time=time)  # type: ignore[method-assign]
+    for k in range(1, 9):
+        lighter = cv2.add(painted(scene, place), (k % 3, k % 3, k % 3, 0))  # else the image is a repeated one
+        found = tracker.handle_frame(np.asarray(lighter, np.uint8), k / FPS)
+    assert found.basis is Basis.PLANE
+    assert found.x == pytest.approx(119.5, abs=1.0)
+    assert found.std == pytest.approx(0.04 * 30.0, rel=0.1)
+
+
 def test_where_the_ground_has_lost_the_target_the_appearance_answers(
     scene: Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:

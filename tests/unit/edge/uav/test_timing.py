@@ -302,6 +302,8 @@ def test_a_turned_camera_is_found_by_its_way_where_it_looks_down_and_the_vehicle
         assert isinstance(found, OffsetEstimate)
         assert found.motion is not None
         assert found.motion.wrong_height == ""
+        wrong = f"the images move as with a heading that is wrong by {turn_deg:.0f} degrees"
+        assert found.motion.wrong_heading == (wrong if turn_deg else "")
 
 
 @pytest.mark.parametrize(("changed", "height_m"), [([1, 1, 1], None), ([1, 1, 1.4], 50), ([1, 1, 0.8], 50)])
