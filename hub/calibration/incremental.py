@@ -32,7 +32,7 @@ from hub.calibration.final_adjustment import MAX_CLOCK_STEPS, bic_prefers, devia
 from hub.calibration.pairs.moved_pair import LEAST_SIDE_S, PairDivision, find_division, time_map_between
 from hub.calibration.pairs.pair_network import describe_failures, expected_lag, solve_new_pairs
 from hub.calibration.pipeline import calibrate, heads_of_people
-from hub.calibration.resection.moved_cameras import Move, moved_camera, without_moved
+from hub.calibration.resection.moved_cameras import Division, Move, moved_camera, without_moved
 from hub.calibration.resection.scan import other_image, scan_resection
 from hub.calibration.result import assemble_calibration
 from hub.calibration.self_calibration import focal_prior, initial_self_calibration, with_cameras, with_lens
@@ -110,7 +110,7 @@ def update_calibration(
     start, move = _start_and_move(rig, observations, last, full)
     observations, last, (prepared, reconstruction), steps = start
     origins = prepared.time_origins
-    moved = {} if move is None else {move[0]: move[1][1] / prepared.time_scale(move[0]) + origins[move[0]]}
+    moved = {} if move is None else {move[0]: move[1].times[-1] / prepared.time_scale(move[0]) + origins[move[0]]}
     if moved:
         observations = _without_older_rows(observations, moved)
         prepared = _with_estimated_lenses(rig, prepare(rig, observations), last)
@@ -294,7 +294,7 @@ def _after_move(prepared: PreparedSession, last: Calibration, names: list[str], 
 
 def _start_and_move(
     rig: Rig, observations: Observations, last: Calibration, full: bool
-) -> tuple[_Start, tuple[str, tuple[float, float, float]] | None]:
+) -> tuple[_Start, tuple[str, Division] | None]:
     """As `_with_clock_steps`, and the camera that was moved since, as `moved_camera` gives it.
 
     A step explains a part of a move, while of what a step leaves two poses explain nothing: of both it is a move.

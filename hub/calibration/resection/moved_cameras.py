@@ -2,12 +2,15 @@
 
 A camera was moved where, at one and the same lag, its rows before and after some time each have a pose that explains
 them, and both poses by far more than one does: a wrong lag or lens and a clock that steps are no better off with two.
+Of a camera that was moved several times the same holds for all parts between.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,6 +53,9 @@ _SUSPECTS = 4
 own may change least, as the path follows them."""
 _END_S = 4.0
 """Of the ends more rows are used, each counting less: of 150 s evenly spaced, those of a side lasted 4 to 7 s."""
+_MOST_MOVES, _WINDOWS = 3, (2, 4)
+"""Moves of one camera that are looked for in a recording, and in how many parts of its rows its lag is looked for: of
+four at least one is without any of three moves."""
 _MARGIN_S = 0.3
 """Around a move, left out too: nobody moves a camera in an instant, and the rows were smoothed across it."""
 
@@ -57,12 +63,13 @@ _MARGIN_S = 0.3
 @dataclass(frozen=True, slots=True)
 class Move:
     """A move of a camera at ``time`` [s] on its clock, by an angle of ``turned`` [rad]. keeps_later: its later rows are
-    used; rows: how many are left out."""
+    used; rows: how many are left out; among: times [s] of other moves among these."""
 
     time: float
     turned: float
     keeps_later: bool
     rows: int
+    among: tuple[float, ...] = ()
 
     def warning(self, name: str, *others: str) -> str:
         """One sentence for a person. others: it was moved or one of these, and by what angle is not known."""
@@ -71,34 +78,60 @@ class Move:
             who = f"one of {', '.join((name, *others))} was moved at {name}'s time {self.time:.1f} s"
             return f"{who}: the {self.rows} rows {side} that were left out"
         who = f"{name}: it was moved (turned by about {np.degrees(self.turned):.2g}°) at its time {self.time:.1f} s"
-        return f"{who}: its {self.rows} rows {side} that were left out"
+        again = f" (it was also moved at {' and '.join(f'{time:.1f}' for time in self.among)} s)" if self.among else ""
+        return f"{who}: its {self.rows} rows {side} that were left out{again}"
+
+
+class Division(NamedTuple):
+    """Moves of a camera: by how much the cost of one pose is more than that of all of them, the times [s since the
+    origin of its track] that divide its rows, and the angles [rad] between the poses on either side of each."""
+
+    gain: float
+    times: tuple[float, ...]
+    turned: tuple[float, ...]
 
 
 def moved_cameras(solution: Solution, observations: Observations) -> dict[str, Move]:
     """The refused cameras that were moved, and of the others the one that most probably was."""
     reconstruction, prepared = solution.reconstruction, solution.prepared
-    divisions: dict[str, tuple[float, float, float]] = {}
+    divisions: dict[str, Division] = {}
     for name in [name for name in prepared.cameras if name not in reconstruction.names]:
         labels = seen_labels(prepared.cameras[name], reconstruction)
         maps = _likely_maps(labels, prepared.cameras[name]) if labels and len(reconstruction.names) > 1 else []
-        found = max((one for at in maps if (one := _divide(labels, prepared.cameras[name], *at))), default=None)
+        found = max(
+            (one for at in maps if (one := _divide(labels, prepared.cameras[name], *at, _MOST_MOVES))), default=None
+        )
         divisions |= {} if found is None else {name: found}
-    placed = moved_camera(prepared, reconstruction)
+    placed = moved_camera(prepared, reconstruction, _MOST_MOVES)
     divisions |= {} if placed is None else {placed[0]: placed[1]}
-    out = {}
-    for name, (_, at, turned) in divisions.items():
-        time = at / prepared.time_scale(name) + prepared.time_origins[name]
-        rows = np.concatenate([track.time for track in observations.of_camera(name)])
-        before, after = int((rows < time).sum()), int((rows > time).sum())
-        out[name] = Move(time, turned, after > before, min(before, after))
-    return out
+    return {
+        name: _longest_part(
+            np.array(found.times) / prepared.time_scale(name) + prepared.time_origins[name],
+            found.turned,
+            np.concatenate([track.time for track in observations.of_camera(name)]),
+        )
+        for name, found in divisions.items()
+    }
+
+
+def _longest_part(moved: Floats, turned: tuple[float, ...], rows: Floats) -> Move:
+    """The move before the part with most rows, or behind it where it is the first. What follows it is left for later.
+
+    moved: times (k,) of the moves; turned: by what angles; rows: times (n,) of all rows.
+    """
+    parts = np.diff(np.searchsorted(np.sort(rows), moved), prepend=0, append=len(rows))
+    longest = int(parts.argmax())
+    at = max(longest - 1, 0)
+    others = tuple(moved[:at].tolist()) if longest else tuple(moved[1:].tolist())
+    left_out = int(parts[:longest].sum() if longest else parts[1:].sum())
+    return Move(float(moved[at]), turned[at], longest > 0, left_out, others)
 
 
 def moved_camera(
-    prepared: PreparedSession, reconstruction: Reconstruction
-) -> tuple[str, tuple[float, float, float]] | None:
-    """Of the placed cameras the one that most probably was moved, which distorts the path for all: its name, gain, time
-    [s] since its origin and angle [rad]. None where none was, or where fewer than two others are placed.
+    prepared: PreparedSession, reconstruction: Reconstruction, most: int = 1
+) -> tuple[str, Division] | None:
+    """Of the placed cameras the one that most probably was moved, which distorts the path for all, at most ``most``
+    times. None where none was, or where fewer than two others are placed.
 
     It is the one without which the others fit best. The path may follow it, where it has the most frames, and then the
     others seem to have been moved: of two of those, one that was moved before fits the path of those left no better.
@@ -108,10 +141,10 @@ def moved_camera(
     changes = {name: _cost_change(_costs(reconstruction, name)) for name in reconstruction.names}
     if max(changes.values()) >= _LEAST_PX**2:
         likely = _best_without(prepared, reconstruction, changes)
-        found = None if likely is None else _division(prepared, reconstruction, *likely)
+        found = None if likely is None else _division(prepared, reconstruction, *likely, most)
         if likely is not None and found is not None:
             return likely[0], found
-    divided = {name: _division(prepared, reconstruction, name, reconstruction) for name in reconstruction.names}
+    divided = {name: _division(prepared, reconstruction, name, reconstruction, most) for name in reconstruction.names}
     return max(((name, one) for name, one in divided.items() if one), key=lambda one: one[1], default=None)
 
 
@@ -167,8 +200,8 @@ def _without(prepared: PreparedSession, reconstruction: Reconstruction, name: st
 
 
 def _division(
-    prepared: PreparedSession, reconstruction: Reconstruction, name: str, paths: Reconstruction
-) -> tuple[float, float, float] | None:
+    prepared: PreparedSession, reconstruction: Reconstruction, name: str, paths: Reconstruction, most: int
+) -> Division | None:
     """As `_divide`: of a placed camera, against the paths of a reconstruction with or without it."""
     given, clock = prepared.cameras[name], reconstruction.state.cameras[reconstruction.names.index(name)]
     lens, labels = clock.intrinsics, seen_labels(given, paths)
@@ -176,7 +209,7 @@ def _division(
         rays = [lens.unproject(given.intrinsics.project_normalised(one.track.points)) for one in labels]
         labels = [replace(one, track=replace(one.track, points=ray)) for one, ray in zip(labels, rays, strict=True)]
     offset = clock.offset - clock.rate * clock.centre
-    return _divide(labels, replace(given, intrinsics=lens), clock.rate, offset) if labels else None
+    return _divide(labels, replace(given, intrinsics=lens), clock.rate, offset, most) if labels else None
 
 
 def without_moved(observations: Observations, moves: Mapping[str, Move]) -> Observations:
@@ -193,15 +226,17 @@ def without_moved(observations: Observations, moves: Mapping[str, Move]) -> Obse
 
 
 def _likely_maps(labels: list[SeenLabel], camera: CameraInput) -> list[tuple[float, float]]:
-    """Rates and offsets at which one half of a camera's rows has a pose: a move leaves one half untouched."""
+    """Rates and offsets at which one part of a camera's rows has a pose: a move leaves the others untouched."""
     moments, maps = path_moments(labels), []
-    for later in (False, True):
+    times = np.concatenate([one.track.time for one in labels])
+    for begin, end in (window for count in _WINDOWS for window in pairwise(np.linspace(0.0, 1.0, count + 1).tolist())):
+        first, last = np.quantile(times, (begin, end))
         samples = []
         for one in labels:
             time, points = along_path(one.track)
-            half = (time >= float(np.median(one.track.time))) == later
-            samples.append((one, time[half], points[half]))
-        scan = sorted(moment_scan(labels, moments, 1.0, later), key=lambda one: one.score)
+            inside = (time >= first) & (time <= last)
+            samples.append((one, time[inside], points[inside]))
+        scan = sorted(moment_scan(labels, moments, 1.0, (begin, end)), key=lambda one: one.score)
         placed = [verify(one, samples, camera) for one in scan[: LIKELY_CANDIDATES // 2]]
         maps += [(one.rate, one.offset) for one in placed if one.inliers >= MIN_INLIERS]
     return maps
@@ -236,11 +271,32 @@ def best_division(
     return best
 
 
-def _divide(
-    labels: list[SeenLabel], camera: CameraInput, rate: float, offset: float
-) -> tuple[float, float, float] | None:
-    """By how much the cost of one pose is more than that of two, the time [s] that divides their rows, and the angle
-    between them; None if one pose does."""
+class _Rows(NamedTuple):
+    """Rows in the order of their times (n,) [s]: positions (n, 3), image points (n, 2) and weights (n,).
+
+    least: rows of either side of a move.
+    """
+
+    world: Floats
+    image: Floats
+    times: Floats
+    weight: Floats
+    focal: float
+    least: int
+
+    def part(self, rows: slice) -> _Rows:
+        """Some of them."""
+        part = {name: getattr(self, name)[rows] for name in ("world", "image", "times", "weight")}
+        return self._replace(**part)
+
+    def costs(self, rows: slice = slice(None)) -> Floats:
+        """Costs (n,) [px²] of all rows under the pose that fits some of them."""
+        residual = resected_residuals(self.world[rows], self.image[rows], self.world, self.image, self.focal)
+        return np.asarray(self.weight * np.minimum(residual, TRUNCATION_PX) ** 2)
+
+
+def _divide(labels: list[SeenLabel], camera: CameraInput, rate: float, offset: float, most: int) -> Division | None:
+    """The moves, at most ``most``, that explain a camera's rows; None if one pose does, or if they do not."""
     samples = [(one, one.track.time, one.track.points) for one in labels]
     world, image, internal = common_rows(samples, rate, offset)
     if not len(internal):
@@ -251,30 +307,40 @@ def _divide(
     every, often = (max(1, int(np.count_nonzero(part)) // _MOST_ROWS) for part in (times, is_end))
     picked = np.flatnonzero((row % every == 0) | (is_end & (row % often == 0)))
     used, weight = order[picked], np.diff(picked, append=len(order)) * len(picked) / len(order)
-    world, image, times = world[used], image[used], (internal[used] - offset) / rate
-    count, focal, least = len(times), camera.intrinsics.focal, max(MIN_POINTS, LEAST_ROWS // often)
-    if count < 2 * least:
+    times, least = (internal[used] - offset) / rate, max(MIN_POINTS, LEAST_ROWS // often)
+    rows = _Rows(world[used], image[used], times, weight, camera.intrinsics.focal, least)
+    found = _still_parts(rows, most)
+    if found is None or not found[1]:
         return None
-
-    def costs(part: slice) -> Floats:
-        residual = resected_residuals(world[part], image[part], world, image, focal)
-        return np.asarray(weight * np.minimum(residual, TRUNCATION_PX) ** 2)
-
-    by_one = costs(slice(None))
-    together = float(by_one.mean())
-    if together < _LEAST_PX**2:
-        return None  # whatever two poses explain
-    cost, at = best_division(count, least, costs, (*STARTS, likely_division(by_one)))
-    if at in (least, count - least) or min(times[at - 1] - times[0], times[-1] - times[at]) < _LEAST_S:
-        return None  # or the move is nearer to an end yet, and some rows beyond it would be taken for this side's
-    poses = resect(world[:at], image[:at]), resect(world[at:], image[at:])
-    limit = weight * TRUNCATION_PX**2
-    explained = [
-        float(np.average((costs(part) < limit)[part], weights=weight[part])) for part in (slice(at), slice(at, None))
-    ]
-    gain = together / max(cost, 1e-9)
-    moved = gain >= MIN_CANDIDATE_RATIO and together - cost >= _LEAST_PX**2
-    if not moved or min(explained) < MIN_INLIERS or poses[0] is None or poses[1] is None:
+    cost, cuts = found
+    poses = [resect(rows.world[a:b], rows.image[a:b]) for a, b in pairwise((0, *cuts, len(times)))]
+    turns = [one[0] @ other[0].T for one, other in pairwise(poses) if one is not None and other is not None]
+    if len(turns) < len(cuts):
         return None
-    cosine = 0.5 * (np.trace(poses[0][0] @ poses[1][0].T) - 1.0)
-    return gain, float(0.5 * (times[at - 1] + times[at])), float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    cosines = np.clip([0.5 * (np.trace(turn) - 1.0) for turn in turns], -1.0, 1.0)
+    middles = 0.5 * (times[np.array(cuts) - 1] + times[cuts])
+    gain = float(rows.costs().sum()) / max(cost, 1e-9)
+    return Division(gain, tuple(middles.tolist()), tuple(np.arccos(cosines).tolist()))
+
+
+def _still_parts(rows: _Rows, most: int) -> tuple[float, list[int]] | None:
+    """What rows cost by one pose for each part between moves [px²], and the rows at which parts begin, but the first.
+
+    most: moves. None if one pose explains a part, or all where there is no move, too badly.
+    """
+    count, by_one = len(rows.times), rows.costs()
+    together, explained = float(by_one.sum()), by_one < rows.weight * TRUNCATION_PX**2
+    one = (together, list[int]()) if np.average(explained, weights=rows.weight) >= MIN_INLIERS else None
+    if most == 0 or together < count * _LEAST_PX**2 or count < 2 * rows.least:
+        return one  # whatever two poses explain
+    _, at = best_division(count, rows.least, rows.costs, (*STARTS, likely_division(by_one)))
+    times = rows.times
+    if at in (rows.least, count - rows.least) or min(times[at - 1] - times[0], times[-1] - times[at]) < _LEAST_S:
+        return one  # or the move is nearer to an end yet, and some rows beyond it would be taken for this side's
+    before = _still_parts(rows.part(slice(at)), most - 1)
+    after = None if before is None else _still_parts(rows.part(slice(at, None)), most - 1 - len(before[1]))
+    if before is None or after is None:
+        return one
+    cost, cuts = before[0] + after[0], [*before[1], at, *(at + cut for cut in after[1])]
+    gains = together / max(cost, 1e-9) >= MIN_CANDIDATE_RATIO and together - cost >= count * _LEAST_PX**2
+    return (cost, cuts) if gains else one

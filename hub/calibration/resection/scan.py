@@ -228,11 +228,11 @@ def path_moments(labels: list[SeenLabel]) -> _PathMoments | None:
 
 
 def moment_scan(
-    labels: list[SeenLabel], moments: _PathMoments | None, rate: float, later_half: bool | None = None
+    labels: list[SeenLabel], moments: _PathMoments | None, rate: float, part: tuple[float, float] = (0.0, 1.0)
 ) -> list[TimeMapCandidate]:
     """The best lags in each octave of support by the direct linear transform, from 40 correlations by FFT.
 
-    later_half: of the camera's rows only those in that half of its time; None = all.
+    part: of the camera's rows only those between these shares of its time.
 
     Over the camera matrix with rows p1, p2, p3 the squared image residual is that of p1 X - u p3 X and p2 X - v p3 X
     over (p3 X)². p1 and p2 follow from p3 (Schur complement), which leaves a generalised eigenvalue of order four.
@@ -242,8 +242,8 @@ def moment_scan(
     products, instants = moments.products, moments.products.shape[2]
     grid = grid_tracks([one.track.scaled(rate) for one in labels], _STEP_S, 0.5)
     u, v = grid.points[:, :, 0], grid.points[:, :, 1]
-    late = 2 * np.arange(u.shape[1]) >= u.shape[1]
-    weight = grid.weight if later_half is None else grid.weight * (late == later_half)
+    share = (np.arange(u.shape[1]) + 0.5) / u.shape[1]
+    weight = grid.weight * ((share > part[0]) & (share < part[1]))
     image = weight * np.stack([np.ones_like(u), u, v, u**2 + v**2])
     length = fast_length(instants + u.shape[1])
     spectra, others = rfft(products, length), np.conj(rfft(image, length))

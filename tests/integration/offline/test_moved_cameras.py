@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +33,25 @@ def test_a_turned_camera_is_named_and_its_longer_side_is_used(cameras: int, sinc
         assert np.linalg.norm(off) < 3.0 * np.linalg.norm(found.cameras[name].position_std) + 1e-9
     error = session.clock_error("cam2", found.reference, found.cameras["cam2"].time_map)
     assert abs(error) < 1e-3
+
+
+@pytest.mark.parametrize("times", [(17.0, 43.0), (15.0, 30.0), (12.0, 24.0, 40.0)])
+def test_a_camera_that_was_moved_several_times_is_placed_by_its_longest_part(times: tuple[float, ...]) -> None:
+    session = simulate(7, 3, 60)
+    clock = session.clocks["cam2"]
+    turned = [session]
+    for since, angle in zip(times, (0.1, -0.06, 0.15), strict=False):
+        turned.append(turned[-1].turned("cam2", since, angle))
+    found = calibrate(*_given(turned[-1]), thorough=True)
+    text = " ".join(text for text in found.warnings if "moved" in text)
+    for since in times:
+        shown = (since - clock.time_offset) / clock.clock_rate
+        named = [float(number) for number in re.findall(r"-?\d+\.\d(?= s:| and | s\))", text)]
+        assert min(abs(shown - one) for one in named) < 0.5, text
+    longest = int(np.diff([0.0, *times, 60.0]).argmax())
+    as_kept = replace(session, poses=turned[longest].poses)
+    assert as_kept.turn_error({name: camera.pose for name, camera in found.cameras.items()}) < 0.01
+    assert abs(session.clock_error("cam2", found.reference, found.cameras["cam2"].time_map)) < 1e-3
 
 
 def test_a_moved_camera_is_named_though_the_path_follows_it_where_only_one_other_sees_the_target() -> None:
