@@ -237,7 +237,7 @@ def _from_newest_side(
     except Refused as refusal:
         raise Refused(f"{warning}; {refusal.reason}", dict.fromkeys(moves, "one of two cameras was moved")) from refusal
     found = replace(update.calibration, warnings=(*update.calibration.warnings, warning))
-    return Update(found, {name: move.time for name, move in moves.items()} | update.moved)
+    return Update(found, {name: move.times[-1] for name, move in moves.items()} | update.moved)
 
 
 def _since_a_move_of_two(

@@ -75,7 +75,7 @@ class PairDivision:
         rows = {name: np.concatenate([track.time for track in observations.of_camera(name)]) for name in times}
         before, after = (sum(int((sign * (rows[k] - at) > 0.0).sum()) for k, at in times.items()) for sign in (-1, 1))
         later = after > before if keeps_later is None else keeps_later
-        return {name: Move(at, turned, later, before if later else after) for name, at in times.items()}
+        return {name: Move((at,), (turned,), int(later), before if later else after) for name, at in times.items()}
 
 
 def time_map_between(a: CameraState, b: CameraState) -> tuple[float, float]:

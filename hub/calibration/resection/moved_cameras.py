@@ -62,24 +62,33 @@ _MARGIN_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A move of a camera at ``time`` [s] on its clock, by an angle of ``turned`` [rad]. keeps_later: its later rows are
-    used; rows: how many are left out; among: times [s] of other moves among these."""
+    """Moves of a camera at ``times`` [s] on its clock, by angles of ``turned`` [rad]. part: of the parts between them,
+    the one that is used; rows: how many are left out."""
 
-    time: float
-    turned: float
-    keeps_later: bool
+    times: tuple[float, ...]
+    turned: tuple[float, ...]
+    part: int
     rows: int
-    among: tuple[float, ...] = ()
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Begin and end of the part that is used, infinite where no move bounds it."""
+        bounds = (-np.inf, *self.times, np.inf)
+        return bounds[self.part], bounds[self.part + 1]
 
     def warning(self, name: str, *others: str) -> str:
         """One sentence for a person. others: it was moved or one of these, and by what angle is not known."""
-        side = "before" if self.keeps_later else "after"
+        side = "before" if self.part else "after"
         if others:
-            who = f"one of {', '.join((name, *others))} was moved at {name}'s time {self.time:.1f} s"
+            who = f"one of {', '.join((name, *others))} was moved at {name}'s time {self.times[0]:.1f} s"
             return f"{who}: the {self.rows} rows {side} that were left out"
-        who = f"{name}: it was moved (turned by about {np.degrees(self.turned):.2g}°) at its time {self.time:.1f} s"
-        again = f" (it was also moved at {' and '.join(f'{time:.1f}' for time in self.among)} s)" if self.among else ""
-        return f"{who}: its {self.rows} rows {side} that were left out{again}"
+        angles = " and ".join(f"{np.degrees(angle):.2g}°" for angle in self.turned)
+        when = " and ".join(f"{time:.1f}" for time in self.times)
+        who = f"{name}: it was moved (turned by about {angles}) at its time {when} s"
+        bounds = zip(("before", "after"), self.span, strict=True)
+        left_out = " and ".join(f"{word} {time:.1f} s" for word, time in bounds if np.isfinite(time))
+        where = f"{side} that" if len(self.times) == 1 else left_out
+        return f"{who}: its {self.rows} rows {where} were left out"
 
 
 class Division(NamedTuple):
@@ -115,16 +124,13 @@ def moved_cameras(solution: Solution, observations: Observations) -> dict[str, M
 
 
 def _longest_part(moved: Floats, turned: tuple[float, ...], rows: Floats) -> Move:
-    """The move before the part with most rows, or behind it where it is the first. What follows it is left for later.
+    """The moves, of which the part with most rows is used.
 
     moved: times (k,) of the moves; turned: by what angles; rows: times (n,) of all rows.
     """
     parts = np.diff(np.searchsorted(np.sort(rows), moved), prepend=0, append=len(rows))
     longest = int(parts.argmax())
-    at = max(longest - 1, 0)
-    others = tuple(moved[:at].tolist()) if longest else tuple(moved[1:].tolist())
-    left_out = int(parts[:longest].sum() if longest else parts[1:].sum())
-    return Move(float(moved[at]), turned[at], longest > 0, left_out, others)
+    return Move(tuple(moved.tolist()), turned, longest, int(parts.sum() - parts[longest]))
 
 
 def moved_camera(
@@ -213,13 +219,13 @@ def _division(
 
 
 def without_moved(observations: Observations, moves: Mapping[str, Move]) -> Observations:
-    """The observations without the rows on the shorter side of each move."""
+    """The observations of which those of moved cameras are from the part that is used."""
     tracks = {}
     for key, track in observations.tracks.items():
         move = moves.get(key[0])
         if move is not None:
-            after = track.time - move.time
-            track = track.select(after > _MARGIN_S if move.keeps_later else after < -_MARGIN_S)
+            begin, end = move.span
+            track = track.select((track.time > begin + _MARGIN_S) & (track.time < end - _MARGIN_S))
         if len(track):
             tracks[key] = track
     return replace(observations, tracks=tracks)
