@@ -174,7 +174,8 @@ def is_unique_at_noise_floor(best: PairFit, others: list[PairFit], s: PairSettin
     """Ambiguity test for slow motion: residual at the noise floor, strong, and no other alignment nearly as strong.
 
     For slow motion a null distribution cannot decide, because seven parameters fit a few cycles of any motion. But then
-    some of the many other lags fit as well; if none does, the alignment is unique.
+    some of the many other lags fit as well; if none does, the alignment is unique. Of others with points behind a
+    camera only those of motion in a plane count: there the geometry, and with it what is behind, is not determined.
     """
     if (
         best.inliers < _MIN_INLIERS
@@ -185,7 +186,8 @@ def is_unique_at_noise_floor(best: PairFit, others: list[PairFit], s: PairSettin
     if not isinstance(best.geometry, RelativePose):
         return False  # without intrinsics two more parameters fit more of any motion
     own = strength(best)
-    next_best = max((strength(fit) for fit in others if fit.in_front > _MIN_INLIERS), default=0.0)
+    possible = (fit for fit in others if fit.in_front > _MIN_INLIERS or is_planar(fit, s))
+    next_best = max((strength(fit) for fit in possible), default=0.0)
     large_gap = own - next_best >= s.unique_min_margin and next_best <= s.max_evidence_ratio * own
     return own >= s.unique_min_strength and large_gap
 

@@ -62,6 +62,8 @@ def test_a_unique_alignment_at_the_noise_floor_is_accepted() -> None:
         [replace(SLOW, cycles=0.7)],  # few cycles
         [replace(SLOW, cycles=0.9), replace(SHORT, cycles=0.4)],  # small margin of strength over the next
         [replace(SLOW, cycles=8.0), replace(SHORT, cycles=4.5)],  # the next is over half as strong: periodic motion
+        # a plane explains 29 s of another one: what is behind a camera there is not determined
+        [SLOW, replace(SHORT, support=29.0, moving_overlap=29.0, cycles=8.0, in_front=0.6, planar_residual_px=0.4)],
         [replace(SLOW, misfit=1.0)],  # residual above the noise
         [replace(SLOW, residual_px=0.6)],
         [
