@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.special import chdtri, fdtri
 
 from edge.lens.board import MIN_CORNERS, BoardView
 from protocols.core.errors import Refused
@@ -22,22 +23,27 @@ COVERAGE_GRID = (8, 6)
 """Columns and rows of the grid over the image on which coverage is counted."""
 MIN_VIEWS = 8
 """From so many views on a lens counts as measured; fewer give one with a wide std, if they fix it at all."""
-_LEAST_VIEWS, _FEW_FOCAL_STD = 3, 0.05  # of which a focal length follows at all; relative, for few views
+_LEAST_VIEWS = 3  # of which a focal length follows at all
+_FEW_FOCAL_STD = {False: 0.05, True: 0.02}
+"""Relative, for few views, of a fisheye lens: views face on gave such focal lengths 35 % off at a std of 4 %."""
+_NO_SHAPE = "no board, flat or bowed, fits these views: are its squares the ones given, is the zoom fixed?"
 _CHECK_BOARD = "check its kind, squares (not the corners between them) and dictionary"
 _MAX_VIEWS = 40  # bounds the solution's time
 _MIN_COVERAGE = 0.5  # of the image's cells: distortion is extrapolated beyond
 _MAX_RMS = 1.0  # px, at a width of up to 1280
 _MAX_FOCAL_STD = 0.004  # relative
 _PRINCIPAL_POINT_STD = 0.012  # of the larger image side, of usual cameras about the middle
-_FEW_FLAGS = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
+_USUAL = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
+_WIDER = cv2.CALIB_FIX_K3, 0
+"""What a few views leave as of usual lenses; and less, where these do not fit."""
 _REACHES = (np.inf, 85.0, 75.0, 65.0)
 """Degrees from the middle of a picture, were it 180 wide, within which corners count: 85 are 90 of one of 190, 65 of
 one of 250."""
 _OUTLIER_RATIO = 2.5  # times the median view's rms
 _SHAPE = 4  # parameters of a board's shape: of a quadratic surface, and the rows' distance over the columns', less 1
-_MISSHAPEN, _CONVERGED, _MAX_ROUNDS = {3: 16.27, 4: 18.47}, 1e-6, 20
-"""Chi-squared by degrees of freedom above which a board is no plane of squares (0.1 % of true ones), share of the cost
-by which the last round of its adjustment lowers it, and the most rounds."""
+_BY_CHANCE = 1e-3  # share of true boards that are taken for misshapen, of usual lenses for others
+_CONVERGED, _MAX_ROUNDS = 1e-6, 20
+"""Share of the cost by which the last round of an adjustment of a board's shape lowers it, and the most rounds."""
 _MAX_CHANGE, _CHANGED = 2.0 * _MAX_FOCAL_STD, 4.2
 """Change of the focal length between two views, of which half is an error as large as the std allowed, and the ratio to
 its std from which it is one: by chance at any of 39 places in 0.1 % of the lenses."""
@@ -103,7 +109,6 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
     if not views:
         raise Refused(f"the board is in no frame: {_CHECK_BOARD}, and that it is sharp and lit")
     few = len(views) < MIN_VIEWS
-    held = few and not fisheye
     if len(views) < _LEAST_VIEWS:
         found = f"the board is seen in {len(views)} different views"
         need = f"{_LEAST_VIEWS} give an approximate lens, {MIN_VIEWS} a good one"
@@ -113,7 +118,8 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
     corners = np.concatenate([view.points for view in views])
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     accepted = [replace(views[i], points=views[i].points - middle) for i in chosen]
-    accepted = _ahead(accepted, size) if fisheye else accepted
+    limit = _MAX_RMS * max(1.0, size[0] / 1280)
+    accepted = _ahead(accepted, size, limit) if fisheye else accepted
     cells = _corner_counts(accepted, size)
     coverage = float((cells > 0).mean())
     if coverage < _MIN_COVERAGE and not few:
@@ -123,24 +129,24 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
             f"move it into {empty} too"
         )
     try:
-        fit, at, free = _with_board(accepted, size, fisheye, held)
+        fit, at, free = _usual(accepted, size) if few and not fisheye else _with_board(accepted, size, fisheye, 0)
         view_rms = _view_rms(at)
         outlier = view_rms > _OUTLIER_RATIO * float(np.median(view_rms))
         if outlier.any() and (~outlier).sum() >= MIN_VIEWS:  # blurred, or with mismatched corners
             accepted = [view for view, out in zip(accepted, outlier, strict=True) if not out]
-            fit, at, free = _with_board(accepted, size, fisheye, held)
+            fit, at, free = _with_board(accepted, size, fisheye, 0)
     except (cv2.error, np.linalg.LinAlgError) as error:
         reason = " ".join(str(getattr(error, "err", error)).split())
         raise Refused(f"no camera model fits these views ({reason}): tilt the board in different directions") from None
-    std, rms = _focal_std(fit, at, free, size, held), float(np.sqrt(np.mean(_view_rms(at) ** 2)))
-    limit = _MAX_RMS * max(1.0, size[0] / 1280)
+    rms = float(np.sqrt(np.mean(_view_rms(at) ** 2)))
     if not np.isfinite(rms) or rms > limit:
         other = "without" if fisheye else "with"
         raise Refused(
             f"the reprojection error is {rms:.2f} px, {limit:.2f} px are allowed: is the board flat, are its "
             f"squares the ones given, is the picture sharp and the zoom fixed? Or try {other} --fisheye"
         )
-    limit_std = _FEW_FOCAL_STD if few else _MAX_FOCAL_STD
+    std = _focal_std(fit, at, free, size)
+    limit_std = _FEW_FOCAL_STD[fisheye] if few else _MAX_FOCAL_STD
     if not std < limit_std:
         raise Refused(
             f"the focal length is known only to {100 * std:.2g} % (std), {100 * limit_std:.1f} % are needed: "
@@ -174,26 +180,50 @@ def coverage_map(cells: Ints) -> list[str]:
     return ["".join(f"{value:5d}" if value else "    ." for value in row) for row in cells.tolist()]
 
 
+def _usual(views: list[BoardView], size: tuple[int, int]) -> tuple[_Fit, _Linearised, Floats]:
+    """The fit of few views with the fewest parameters that they do not refute (F test), as `_with_board` gives it.
+
+    Of pixels that are 2 % wider than high focal lengths were 13 stds off.
+    """
+    best: tuple[_Fit, _Linearised, Floats] | None = None
+    for fixed in (_USUAL, *_WIDER):
+        with suppress(Refused, cv2.error, np.linalg.LinAlgError):  # of the wider ones
+            now = _with_board(views, size, False, fixed)
+            if best is None or _better(now, best):
+                best = now
+    if best is None:
+        raise Refused(_NO_SHAPE)
+    return best
+
+
+def _better(now: tuple[_Fit, _Linearised, Floats], before: tuple[_Fit, _Linearised, Floats]) -> bool:
+    """Whether a fit's further parameters, if any, lower the cost by more than they do by chance."""
+    (_, at, free), more = now, now[2].shape[1] - before[2].shape[1]
+    least = more * float(fdtri(more, _redundancy(at, free), 1.0 - _BY_CHANCE)) if more > 0 else 0.0
+    return before[1].cost - at.cost > least * _noise(at, free)
+
+
 def _with_board(
-    views: list[BoardView], size: tuple[int, int], fisheye: bool, held: bool
+    views: list[BoardView], size: tuple[int, int], fisheye: bool, fixed: int
 ) -> tuple[_Fit, _Linearised, Floats]:
     """The fit, with the board's shape where the corners ask for one, its residuals, and the columns of the parameters
     that are estimated.
 
     A sheet that is bowed by a hundredth of its width made focal lengths 1.4 % wrong at a stated 0.15 %, one that was
-    printed 2 % too wide 1.2 %. OpenCV's own estimate of a board's shape needs all corners in each view. held: only what
-    a few views determine is estimated, focal length, k1 and k2; the rest as of usual lenses.
+    printed 2 % too wide 1.2 %. OpenCV's own estimate of a board's shape needs all corners in each view. fixed: OpenCV's
+    flags of what is not estimated but as of usual lenses: ``_USUAL`` leaves focal length, k1 and k2.
     """
-    fit = _fisheye(views, size) if fisheye else _pinhole(views, size, held)
+    fit = _fisheye(views, size) if fisheye else _pinhole(views, size, fixed)
     at, unit = _linearise(views, fit, fisheye), np.eye(len(fit.parameters))
-    flat = np.column_stack([unit[0] + unit[1], unit[4], unit[5]]) if held else unit[:, :-_SHAPE]
+    held, least = fixed == _USUAL, 8 if fixed & cv2.CALIB_FIX_K3 else len(unit) - _SHAPE
+    flat = np.column_stack([unit[0] + unit[1], unit[4], unit[5]]) if held else unit[:, :least]
     # Beside a principal point that is taken for granted, its error would be a stretch.
     bowed = np.column_stack([flat, unit[:, -_SHAPE:-1] if held else unit[:, -_SHAPE:]])
     count = bowed.shape[1] - flat.shape[1]
     inverse = _inverse(bowed.T @ at.information @ bowed)
     shape = (inverse @ bowed.T @ at.gradient)[-count:]
     statistic = float(shape @ np.linalg.solve(inverse[-count:, -count:], shape)) / _noise(at, bowed)
-    if not statistic > _MISSHAPEN[count]:
+    if not statistic > float(chdtri(count, _BY_CHANCE)):
         return fit, at, flat
     damping, before = 0.0, np.inf
     for _ in range(_MAX_ROUNDS):
@@ -208,10 +238,10 @@ def _with_board(
             fit, at, before, damping = new, now, at.cost, damping / 10.0
         else:
             damping = max(10.0 * damping, 1e-3)
-    raise Refused("no board, flat or bowed, fits these views: are its squares the ones given, is the zoom fixed?")
+    raise Refused(_NO_SHAPE)
 
 
-def _pinhole(views: list[BoardView], size: tuple[int, int], held: bool) -> _Fit:
+def _pinhole(views: list[BoardView], size: tuple[int, int], fixed: int) -> _Fit:
     """From a usual field of view, and from the views' homographies (Zhang 2000), which views face on do not allow.
 
     Of a few corners far from the middle OpenCV may take a wrong pose, from one start and not from the other.
@@ -219,9 +249,8 @@ def _pinhole(views: list[BoardView], size: tuple[int, int], held: bool) -> _Fit:
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32)[:, None] for view in views]
     guess: Any = intrinsics_from_field_of_view(size, 65.0, False).matrix
-    few = _FEW_FLAGS if held else 0
     fits: list[Any] = []
-    for start, flags in ((guess, few | cv2.CALIB_USE_INTRINSIC_GUESS), (None, few)):
+    for start, flags in ((guess, fixed | cv2.CALIB_USE_INTRINSIC_GUESS), (None, fixed)):
         with suppress(cv2.error):
             fits.append(cv2.calibrateCamera(points, pixels, size, start, np.zeros(5), flags=flags))
     return _best(fits, 5)
@@ -242,10 +271,11 @@ def _fisheye(views: list[BoardView], size: tuple[int, int]) -> _Fit:
     return _best(fits, 4)
 
 
-def _ahead(views: list[BoardView], size: tuple[int, int]) -> list[BoardView]:
+def _ahead(views: list[BoardView], size: tuple[int, int], limit: float) -> list[BoardView]:
     """The views with the corners that are surely before the camera, where the fit fails with all of them.
 
-    OpenCV finds no pose of a board with corners 90 degrees from the optical axis, and several such views end it.
+    OpenCV finds no pose of a board with corners 90 degrees from the optical axis, or a wrong one. limit: rms of a view
+    [px] above which a fit has failed.
     """
     middle, focal = 0.5 * (np.array(size) - 1.0), intrinsics_from_field_of_view(size, 180.0, True).focal
     for degrees in _REACHES:
@@ -257,8 +287,8 @@ def _ahead(views: list[BoardView], size: tuple[int, int]) -> list[BoardView]:
         ]
         if len(kept) >= _LEAST_VIEWS:
             with suppress(Refused):
-                _fisheye(kept, size)
-                return kept
+                if float(np.median(_view_rms(_linearise(kept, _fisheye(kept, size), True)))) <= limit:
+                    return kept
     return views
 
 
@@ -314,13 +344,18 @@ def _linearise(views: list[BoardView], fit: _Fit, fisheye: bool) -> _Linearised:
 
 def _noise(at: _Linearised, free: Floats) -> float:
     """Variance of a coordinate of a corner [px²]. free: columns of what is estimated beside the poses."""
-    rows = sum(len(one) for one in at.residuals)
-    return at.cost / float(max(rows - free.shape[1] - 6 * len(at.residuals), 1))
+    return at.cost / _redundancy(at, free)
 
 
-def _focal_std(fit: _Fit, at: _Linearised, free: Floats, size: tuple[int, int], held: bool) -> float:
-    """Relative std of the focal length. held: with what the estimate owes to the principal point that it took
-    for granted (consider covariance)."""
+def _redundancy(at: _Linearised, free: Floats) -> float:
+    """Number of coordinates of corners less that of estimates, at least 1."""
+    return float(max(sum(len(one) for one in at.residuals) - free.shape[1] - 6 * len(at.residuals), 1))
+
+
+def _focal_std(fit: _Fit, at: _Linearised, free: Floats, size: tuple[int, int]) -> float:
+    """Relative std of the focal length, with what the estimate owes to a principal point that it took for granted
+    (consider covariance)."""
+    held = not free[2:4].any()
     centre = np.eye(len(at.gradient))[:, 2:4] * (_PRINCIPAL_POINT_STD * max(size) if held else 0.0)
     inverse = _inverse(free.T @ at.information @ free)
     variance = _noise(at, free) * inverse.diagonal() + np.square(inverse @ free.T @ at.information @ centre).sum(axis=1)

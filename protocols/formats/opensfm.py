@@ -30,16 +30,25 @@ def is_file(file: Path) -> bool:
 def read(file: Path) -> ForeignRig:
     """The largest reconstruction of a file; a camera is named after its shot. Raises InputError."""
     document = json.loads(read_text(file))
-    best = max(document, key=lambda one: len(one["shots"]))
-    lenses = {key: _lens(key, table, file) for key, table in best["cameras"].items()}
+    try:
+        best = max(document, key=lambda one: len(one["shots"]))
+        lenses = {key: _lens(key, table, file) for key, table in best["cameras"].items()}
+        shots = [
+            (shot, table["camera"], table["rotation"], table["translation"]) for shot, table in best["shots"].items()
+        ]
+    except (KeyError, TypeError, AttributeError):
+        what = "not a list of reconstructions with cameras, and shots with camera, rotation and translation"
+        raise InputError(what, file=file, remedy="export it with OpenSfM again") from None
     cameras: dict[str, ForeignCamera] = {}
-    for shot, table in best["shots"].items():
+    for shot, camera, turn, shift in shots:
         name = check_name(PurePosixPath(shot).stem, file=file)
-        if table.get("camera") not in lenses:
+        if name in cameras:
+            raise InputError(f"a second shot {name!r}", file=file, remedy="keep one shot a camera")
+        if camera not in lenses:
             raise InputError(f"shot {shot!r} names no camera", file=file, remedy="correct it")
-        rotation = parse_array(table["rotation"], (3,), "rotation", file, None)
-        translation = parse_array(table["translation"], (3,), "translation", file, None)
-        cameras[name] = ForeignCamera(name, lenses[table["camera"]], Pose.from_rodrigues(rotation, translation))
+        rotation = parse_array(turn, (3,), "rotation", file, None)
+        translation = parse_array(shift, (3,), "translation", file, None)
+        cameras[name] = ForeignCamera(name, lenses[camera], Pose.from_rodrigues(rotation, translation))
     if not cameras:
         raise InputError("no shot in it", file=file, remedy="give a reconstruction with its shots")
     return ForeignRig(cameras)

@@ -39,6 +39,10 @@ _MAX_CHAIN_ERROR = 1e-3  # m, rad: two paths through the cameras agree to roundi
 _MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M")
 _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
 _FISHEYE = ("fisheye", "equidistant", "kannala_brandt")
+_PINHOLE = (
+    "plumb_bob", "rational_polynomial", "radtan", "brown", "brown_conrady", "opencv", "pinhole", "perspective",
+    "standard", "none", "", "rectified",
+)  # fmt: skip
 
 
 def load(file: Path) -> tuple[dict[str, Any], str]:
@@ -122,6 +126,9 @@ def read_kalibr(file: Path) -> ForeignRig:
         if not isinstance(table, dict) or "intrinsics" not in table:
             continue
         name = check_name(str(table.get("name", key)), file=file, line=_line(text, key))
+        if name in lenses:
+            what, line = f"a second camera {name!r}", _line(text, "name", key)
+            raise InputError(what, file=file, line=line, remedy="give each its own name")
         lenses[name] = _kalibr_lens(table, key, text, file)
         if len(lenses) > 1:
             if "T_cn_cnm1" not in table:
@@ -240,6 +247,9 @@ def _opencv_camera(values: Mapping[str, Any], text: str, file: Path) -> ForeignC
         raise InputError("no image size in it", file=file, line=1, remedy=remedy)
     model = str(values.get("distortion_model", "fisheye" if values.get("fisheye_model") else "plumb_bob")).lower()
     fisheye = model in _FISHEYE
+    if not fisheye and model not in _PINHOLE:
+        what, line = f"distortion_model {model!r} is not known here", _line(text, "distortion_model")
+        raise InputError(what, file=file, line=line, remedy="convert it to plumb_bob or equidistant")
     place = next((key for key in _DISTORTION if key in values), None)
     flat = [] if place is None else _rows(values[place])
     # Four coefficients may be plumb_bob's or equidistant's, and camera_info names its model.

@@ -530,6 +530,22 @@ BAD = [
     ("a.yaml", "cam0: {intrinsics: [.nan, 1, 1, 1], resolution: [4, 4]}", "not finite"),
     ("a.yml", "%YAML:1.0\n---\ncamera_matrix: [1, 2]\n", "a.yml:3: camera_matrix has 2 numbers"),
     ("a.yml", "camera_matrix: [[9, 0, 1], [0, 9, 1], [0, 0, 1]]\n", "no image size"),
+    (
+        "unknown_model.yml",
+        "distortion_model: thin\nimage_width: 4\nimage_height: 4\ncamera_matrix: [[9, 0, 1], [0, 9, 1], [0, 0, 1]]\n",
+        "unknown_model.yml:1: distortion_model 'thin' is not known here",
+    ),
+    ("one_name.yaml", CAMCHAIN.replace("cam_overlaps", "name: a\n  cam_overlaps"), "a second camera 'a'"),
+    ("malformed.json", '[{"cameras": {}, "shots": {"a.png": {"camera": "a"}}}]', "not a list of reconstructions"),
+    ("malformed.json", '[{"cameras": [], "shots": {}}]', "not a list of reconstructions"),
+    ("malformed.json", '[{"cameras": {}, "shots": {}}, 1]', "not a list of reconstructions"),
+    (
+        "one_name.json",
+        '[{"cameras": {"c": {"width": 4, "height": 4, "focal": 1}}, "shots": {'
+        '"a/x.png": {"camera": "c", "rotation": [0, 0, 0], "translation": [0, 0, 0]},'
+        '"b/x.png": {"camera": "c", "rotation": [0, 0, 0], "translation": [1, 0, 0]}}}]',
+        "a second shot 'x'",
+    ),
     ("a.toml", "[cam_0]\nname = 'a'\nmatrix = [[1, 0, 1], [0, 1, 1], [0, 0, 1]]\n", "size is missing"),
     ("a.toml", "[cameras.0]\nsize = [4, 4]\nmatrix = [[1, 0], [0, 1]]\n", "a.toml:3"),
     ("a.toml", "x = 1\n", "unknown format"),
