@@ -216,9 +216,9 @@ def _without_repeats(tracks: list[Track], warnings: list[str]) -> list[Track]:
         is_coarse = not (2.0 * track.pixels % 1.0).any()
         kept.append(track if is_coarse else track.select(is_new | rests))
     every = sum(map(len, tracks))
-    share = 1.0 - sum(map(len, kept)) / max(every, 1)
-    if share > _LEAST_REPEATS:
-        warnings.append(f"{tracks[0].camera}: {share:.0%} of its frames repeat the one before and were left out")
+    repeats = every - sum(map(len, kept))
+    if repeats > _LEAST_REPEATS * every:
+        warnings.append(f"{tracks[0].camera}: {repeats / every:.0%} of its frames repeat the one before and were left out")
     return kept
 
 
