@@ -218,7 +218,8 @@ def _without_repeats(tracks: list[Track], warnings: list[str]) -> list[Track]:
     every = sum(map(len, tracks))
     repeats = every - sum(map(len, kept))
     if repeats > _LEAST_REPEATS * every:
-        warnings.append(f"{tracks[0].camera}: {repeats / every:.0%} of its frames repeat the one before and were left out")
+        text = f"{repeats / every:.0%} of its frames repeat the one before and were left out"
+        warnings.append(f"{tracks[0].camera}: {text}")
     return kept
 
 
