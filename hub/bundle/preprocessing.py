@@ -29,6 +29,8 @@ _JUMP_PX = 60.0  # between rows is a jump if longer; a target that leaves a plac
 _CELL_SHARE = CELL_PX / _JUMP_PX  # of a target's rows within a jump of a pixel that it passes: its path is a line there
 _RUN = 3  # rows without a jump are a target in motion: of 30 % false rows all over the image, one in 10^4 begins one
 _FALSE_ALARM = 1e-4  # of a track
+_LONGEST_REPEAT_S = 0.5  # from a new image to the next: no camera films more slowly, and a target that rests is longer
+_LEAST_REPEATS = 0.01  # share of a camera's rows that is worth a warning: pixels of one decimal are equal by chance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +115,9 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
         if clock_step:
             warnings.append(f"{name}: {clock_step}")
         if not rig.shared_clock:  # with one, nothing need move smoothly
-            tracks = [one for track in tracks if len(one := _without_clutter(track, warnings))]
+            tracks = [
+                one for track in _without_repeats(tracks, warnings) if len(one := _without_clutter(track, warnings))
+            ]
         if not tracks:
             refused[name] = "no observations"
             return
@@ -196,6 +200,27 @@ def prepare(rig: Rig, observations: Observations) -> PreparedSession:
         uncalibrated,
         outlines=outlines,
     )
+
+
+def _without_repeats(tracks: list[Track], warnings: list[str]) -> list[Track]:
+    """A camera's tracks without rows at exactly the pixels of the row before; ``warnings`` gets their share.
+
+    A camera that is short of light, or a copy at another frame rate, sends the last image again under a new time: such
+    rows are always late. Whole and half pixels repeat by themselves, and so does a target that rests without noise.
+    """
+    kept = list[Track]()
+    for track in tracks:
+        is_new = np.r_[True, (np.diff(track.pixels, axis=0) != 0.0).any(axis=1)]
+        run = np.cumsum(is_new) - 1
+        rests = np.diff(track.time[np.r_[np.flatnonzero(is_new), -1]])[run] > _LONGEST_REPEAT_S
+        is_coarse = not (2.0 * track.pixels % 1.0).any()
+        kept.append(track if is_coarse else track.select(is_new | rests))
+    every = sum(map(len, tracks))
+    repeats = every - sum(map(len, kept))
+    if repeats > _LEAST_REPEATS * every:
+        text = f"{repeats / every:.0%} of its frames repeat the one before and were left out"
+        warnings.append(f"{tracks[0].camera}: {text}")
+    return kept
 
 
 def _without_clutter(track: Track, warnings: list[str]) -> Track:

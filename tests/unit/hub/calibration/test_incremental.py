@@ -261,6 +261,15 @@ def test_a_move_of_one_of_two_cameras_is_no_clock_step_before_it_can_be_named(se
     assert session.turn_error({name: camera.pose for name, camera in found.cameras.items()}) < 0.01
 
 
+def test_what_a_clock_step_explains_only_a_part_of_is_a_contradiction_until_the_move_can_be_named() -> None:
+    session = simulate(14, 2, 40, windows=[(0, 40)] * 2)
+    last = update_calibration(session.rig, until(session, 20.0), None).calibration
+    rows = until(session.turned("cam1", 20.0, 0.09), 22.5)
+    with pytest.raises(Refused, match=r"the rows contradict the calibration since .*: a camera was moved") as refusal:
+        update_calibration(session.rig, rows, last, full=False)
+    assert set(refusal.value.cameras) == set(session.rig.cameras), "a hub keeps the last answer and names the reason"
+
+
 def test_cameras_that_see_nothing_any_more_stay_as_they_were() -> None:
     session = simulate(3, 4, 40)
     last = update_calibration(session.rig, until(session, 30.0), None).calibration

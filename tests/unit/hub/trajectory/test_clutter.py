@@ -67,3 +67,20 @@ def test_a_session_leaves_a_lamp_out_while_the_target_is_out_of_view_and_says_so
     (warning,) = found.warnings
     assert warning.startswith("cam0: ")
     assert f"({lit.mean():.1%}) are at pixel (384, 432)" in warning
+
+
+@pytest.mark.parametrize(("kind", "share"), [("repeated", 0.3), ("whole pixels", 0.0), ("at rest", 0.0)])
+def test_rows_that_repeat_the_one_before_are_left_out_and_others_are_not(kind: str, share: float) -> None:
+    session, rng = simulate(5, 2), np.random.default_rng(5)
+    tracks = dict(session.observations().tracks)
+    key = next(iter(tracks))
+    track = tracks[key]
+    late = rng.random(len(track)) < 0.3 if kind != "at rest" else np.arange(len(track)) % 200 > 100
+    late[0] = False
+    pixels = track.pixels[np.maximum.accumulate(np.arange(len(track)) * ~late)]
+    tracks[key] = replace(track, pixels=np.rint(pixels) if kind == "whole pixels" else pixels)
+    prepared = prepare(session.rig, Observations(tracks))
+    left_out = len(track) - len(prepared.rows[key[0]][0].time)
+    assert left_out == (late.sum() if share else 0)
+    said = f"{key[0]}: {late.mean():.0%} of its frames repeat the one before and were left out"
+    assert prepared.warnings == ((said,) if share else ())
