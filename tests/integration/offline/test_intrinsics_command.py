@@ -166,7 +166,8 @@ def test_a_border_without_the_board_is_warned_of(
     assert run(command(tmp_path / "cam7", tmp_path / "rig.toml", "charuco")) == 0
     report = json.loads(capsys.readouterr().out)
     (warning,) = [one for one in report["warnings"] if "border" in one]
-    assert what in warning and warning.endswith("show the board near the corners and the sides too")
+    assert what in warning
+    assert warning.endswith("show the board near the corners and the sides too")
     assert (report["border_std_px"] is None) == (k1 == -0.9)
 
 
