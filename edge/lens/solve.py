@@ -17,7 +17,7 @@ from scipy.special import chdtri, fdtri
 from edge.lens.board import MIN_CORNERS, BoardView
 from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
-from protocols.geometry.types import Floats, Ints
+from protocols.geometry.types import Bools, Floats, Ints
 
 COVERAGE_GRID = (8, 6)
 """Columns and rows of the grid over the image on which coverage is counted."""
@@ -57,12 +57,15 @@ class LensCalibration:
     rms_px: root mean square reprojection error of the corners. focal_std: relative std of the focal length. views:
     number used. cells: (6, 8) number of corners per grid cell. coverage: fraction of cells with any. bow: how far the
     board departs from a plane [squares], 0 = not measurably. stretch: by how much its squares are longer down than
-    across, relative.
+    across, relative. border_std_px: std of a ray at the picture's border, where it is largest [px], infinite where the
+    lens has none there. border_limit_px: above which the border is not measured: an rms as large would be refused.
     """
 
     intrinsics: Intrinsics
     rms_px: float
     focal_std: float
+    border_std_px: float
+    border_limit_px: float
     views: int
     cells: Ints
     coverage: float
@@ -164,7 +167,8 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
     bow = float(np.ptp(heights - plane @ np.linalg.lstsq(plane, heights)[0]))
     counts = _corner_counts(accepted, size)
     stretch = float(fit.parameters[-1])
-    return LensCalibration(_lens(fit, size, fisheye), rms, std, len(accepted), counts, coverage, bow, stretch)
+    lens, border = _lens(fit, size, fisheye), _border_std(_lens(fit, size, fisheye), at, free)
+    return LensCalibration(lens, rms, std, border, limit, len(accepted), counts, coverage, bow, stretch)
 
 
 def intrinsics_from_field_of_view(size: tuple[int, int], degrees: float, fisheye: bool) -> Intrinsics:
@@ -360,6 +364,42 @@ def _focal_std(fit: _Fit, at: _Linearised, free: Floats, size: tuple[int, int]) 
     inverse = _inverse(free.T @ at.information @ free)
     variance = _noise(at, free) * inverse.diagonal() + np.square(inverse @ free.T @ at.information @ centre).sum(axis=1)
     return float(np.sqrt(variance[: 1 if held else 2].max())) / float(np.sqrt(fit.parameters[0] * fit.parameters[1]))
+
+
+def _border_std(lens: Intrinsics, at: _Linearised, free: Floats) -> float:
+    """Largest std of a ray at the picture's border [px]: of what is estimated, and with the lens's next parameters,
+    which the corners did not ask for but may be there.
+
+    A rotation that all rays share is the camera's. Of a fisheye lens the border without rays is beyond its circle.
+    """
+    columns, rows = COVERAGE_GRID
+    across, down = np.meshgrid(
+        np.linspace(0, lens.width - 1.0, columns + 1), np.linspace(0, lens.height - 1.0, rows + 1)
+    )
+    border = np.ones(across.shape, bool)
+    border[1:-1, 1:-1] = False
+    rays = lens.unproject(np.column_stack([across.ravel(), down.ravel()]))
+    known: Bools = np.asarray(np.isfinite(rays).all(axis=1))
+    if not known.any() or not (lens.fisheye or known[border.ravel()].all()):
+        return float("inf")
+    points, still = np.column_stack([rays[known], np.ones(known.sum())])[None], np.zeros(3)
+    if lens.fisheye:
+        jacobian = cv2.fisheye.projectPoints(points, still, still, lens.matrix, lens.distortions)[1]
+        by_lens, by_turn = jacobian[:, :8], jacobian[:, 8:11]
+    else:
+        jacobian = cv2.projectPoints(points, still, still, lens.matrix, lens.distortions)[1]
+        by_lens, by_turn = jacobian[:, 6:15], jacobian[:, :3]
+    by_lens = _without_pose(np.asarray(by_lens, np.float64), np.asarray(by_turn, np.float64))
+    count, unit = by_lens.shape[1], np.eye(len(free))
+    fuller = unit[:, : min(count, count if free[2:4].any() else 8)]
+    variances = []
+    for lens_columns in (free, np.column_stack([fuller, free[:, ~free[:count].any(axis=0)]])):
+        by_free = by_lens @ lens_columns[:count]
+        inverse = _inverse(lens_columns.T @ at.information @ lens_columns)
+        variances.append(
+            _noise(at, lens_columns) * ((by_free @ inverse) * by_free).sum(axis=1).reshape(-1, 2).sum(axis=1)
+        )
+    return float(np.sqrt(np.max(variances, axis=0)[border.ravel()[known]].max(initial=0.0)))
 
 
 def _focal_change(fit: _Fit, at: _Linearised, free: Floats) -> tuple[float, float]:

@@ -22,7 +22,7 @@ from protocols.geometry.camera import Intrinsics
 from protocols.geometry.pose import Pose
 from protocols.geometry.types import Floats
 from protocols.session.observations import DEFAULT_LABEL
-from protocols.session.rig import Rig, read_rig
+from protocols.session.rig import Rig, parse_rig
 
 _REPLACED_METADATA = (
     "distances", "wand", "bodies", "bodies_scale", "in_step", "target", "refused", "scale", "solver", "version",
@@ -257,8 +257,8 @@ def read_calibration(file: Path) -> tuple[Rig, dict[str, CameraCalibration]]:
 
     Raises InputError where intrinsics, rotation or translation are missing.
     """
-    rig = read_rig(file)
-    values, _ = read_toml(file, "calibration")
+    values, text = read_toml(file, "calibration")
+    rig = parse_rig(values, file, text)
     cameras: dict[str, CameraCalibration] = {}
     tables = {table.get("name", key): table for key, table in values.items() if isinstance(table, dict)}
     for name, camera in rig.cameras.items():

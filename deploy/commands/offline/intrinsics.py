@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from math import isfinite
 from pathlib import Path
 from typing import Any, Literal
 
@@ -129,6 +130,7 @@ def intrinsics(
             "views": fit.views,
             "rms_px": fit.rms_px,
             "focal_std": fit.focal_std,
+            "border_std_px": fit.border_std_px if isfinite(fit.border_std_px) else None,
             "bow": fit.bow,
             "stretch": fit.stretch,
             "coverage": fit.coverage,
@@ -144,6 +146,8 @@ def intrinsics(
         lines = [f"{focal} {lens.focal:.2f} px ± {100 * fit.focal_std:.2g} %, {fit.views} views"]
         if guess_std:
             lines.append(f"approximate: fewer than {MIN_VIEWS} different views; `syncline calibrate` refines it")
+        if isfinite(fit.border_std_px):
+            lines.append(f"rays at the picture's border ± {fit.border_std_px:.2g} px, where they are known least")
         if fit.bow:
             shape = (
                 f"bowed by {fit.bow:.2g} of a square, its rows {100 * fit.stretch:+.2g} % farther apart than columns"
@@ -152,8 +156,17 @@ def intrinsics(
         covered = f"corners in each part of the image ({100 * fit.coverage:.0f} %):"
         lines += [f"corners fit to {fit.rms_px:.3f} px; {covered}", *coverage_map(fit.cells)]
     # A video is meant to have more frames than different views.
-    warnings = [*reader.warnings, *filter(None, [unused if video.is_dir() else ""])]
+    border = "" if fit is None else _unmeasured_border(fit.border_std_px, fit.border_limit_px)
+    warnings = [*reader.warnings, *filter(None, [unused if video.is_dir() else "", border])]
     return answer(document | {"warnings": warnings}, [*lines, *closing_lines(warnings, [out])], json)
+
+
+def _unmeasured_border(std: float, limit: float) -> str:
+    """The warning of a lens that is extrapolated to the picture's border; empty where it is measured."""
+    if std <= limit:
+        return ""
+    what = f"are known to ± {std:.2g} px only" if isfinite(std) else "are not known, the distortion folds over there"
+    return f"rays at the picture's border {what}: show the board near the corners and the sides too"
 
 
 def _completed(file: Path, name: str, table: dict[str, Any]) -> str:

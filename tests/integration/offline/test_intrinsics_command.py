@@ -14,6 +14,7 @@ import pytest
 from deploy.cli import run
 from edge.detectors.board.description import Board
 from edge.detectors.board.detector import BoardDetector
+from edge.lens.board import BoardView
 from protocols.geometry.camera import Intrinsics
 from tests.support import boards
 
@@ -134,7 +135,7 @@ def test_a_few_views_give_a_lens_with_its_std(tmp_path: Path, capsys: Capture) -
     assert 0.0 < table["focal_std"] < 0.05
     assert abs(table["matrix"][0][0] / PINHOLE.focal - 1) < 3 * table["focal_std"]
     assert report["views"] == 5
-    (warning,) = report["warnings"]
+    warning, _border = report["warnings"]
     assert warning.startswith(
         "3 of 8 photographs are not used: 2 without the board, 1 with fewer than 8 of its corners"
     )
@@ -146,6 +147,28 @@ def test_an_inverted_board_is_found_without_a_setting(tmp_path: Path, capsys: Ca
         cv2.imwrite(str(file), 255 - cv2.imread(str(file)))
     assert run(command(video, tmp_path / "rig.toml", "charuco")) == 0
     assert json.loads(capsys.readouterr().out)["views"] >= 15
+
+
+@pytest.mark.parametrize(("k1", "what"), [(-0.18, "are known to ± "), (-0.9, "are not known, the distortion folds")])
+def test_a_border_without_the_board_is_warned_of(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch, k1: float, what: str
+) -> None:
+    lens = Intrinsics(640, 480, PINHOLE.matrix, np.array([k1, 0.0, 0.0, 0.0, 0.0]))
+    points = np.array([[x, y, 0.0] for y in range(1, 6) for x in range(1, 8)])
+    rng = np.random.default_rng(7)
+    views = []
+    for number, (rotation, centre) in enumerate(boards.board_poses(5, 2, 0.6, 0.1)):
+        pixels = lens.project((points - [4.0, 3.0, 0.0]) @ rotation.T + 1.6 * centre)
+        views.append(BoardView(number, points, pixels + rng.normal(0.0, 0.1, pixels.shape)))
+    monkeypatch.setattr("edge.lens.board.board_views", lambda *_: iter(views))
+    (tmp_path / "cam7").mkdir()
+    cv2.imwrite(str(tmp_path / "cam7" / "0.png"), np.zeros((480, 640, 3), np.uint8))
+    assert run(command(tmp_path / "cam7", tmp_path / "rig.toml", "charuco")) == 0
+    report = json.loads(capsys.readouterr().out)
+    (warning,) = [one for one in report["warnings"] if "border" in one]
+    assert what in warning
+    assert warning.endswith("show the board near the corners and the sides too")
+    assert (report["border_std_px"] is None) == (k1 == -0.9)
 
 
 def test_few_views_or_none_are_refused(tmp_path: Path, capsys: Capture) -> None:

@@ -180,3 +180,33 @@ def test_a_zoom_in_between_is_refused_and_a_fixed_lens_is_not(count: int, fishey
         for zoom in (-0.03, 0.03):
             with pytest.raises(Refused, match=r"the focal length changes by [+-][23]\.\d %"):
                 calibrate_lens(seen(seed, count, 0.6, fisheye, zoom=zoom)[1], SIZE, fisheye)
+
+
+def test_a_border_without_corners_has_a_large_std() -> None:
+    """Distortion is extrapolated there: such lenses were accepted with rays up to 6 px off, without a word."""
+    for seed in range(3):
+        lens, views = seen(seed, 24, 0.6)
+        kept = [np.abs(view.pixels / SIZE - 0.5).max(axis=1) < 0.31 for view in views]
+        middle = [
+            replace(view, points=view.points[near], pixels=view.pixels[near])
+            for view, near in zip(views, kept, strict=True)
+            if near.sum() >= 12
+        ]
+        everywhere, extrapolated = calibrate_lens(views, SIZE), calibrate_lens(middle[:7], SIZE)
+        assert everywhere.border_std_px < everywhere.border_limit_px < extrapolated.border_std_px
+        edge = np.array([[x, y] for x in (0.0, SIZE[0] - 1.0) for y in (0.0, SIZE[1] - 1.0)])
+        for found in (everywhere, extrapolated):
+            rays = np.column_stack([lens.unproject(edge), np.ones(4)])
+            assert np.isfinite(found.border_std_px)
+            turn = _turn_between(lens, found.intrinsics)
+            missed = np.linalg.norm(found.intrinsics.project(rays @ turn.T) - edge, axis=1)
+            assert missed.max() < 4.0 * found.border_std_px
+
+
+def _turn_between(lens: Intrinsics, other: Intrinsics) -> np.ndarray:
+    """The rotation that both lenses' rays of the middle half of the picture share least squares (Kabsch)."""
+    pixels = np.stack(np.meshgrid(np.linspace(0, SIZE[0] - 1, 9), np.linspace(0, SIZE[1] - 1, 7)), -1).reshape(-1, 2)
+    first, second = (np.column_stack([one.unproject(pixels), np.ones(len(pixels))]) for one in (lens, other))
+    first, second = (rays / np.linalg.norm(rays, axis=1)[:, None] for rays in (first, second))
+    left, _, right = np.linalg.svd(second.T @ first)
+    return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)

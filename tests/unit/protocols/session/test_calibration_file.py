@@ -264,3 +264,9 @@ def test_a_float_of_an_intrinsics_field_is_toml(tmp_path: Path, rig: Rig) -> Non
     odd.cameras["eye"] = replace(odd.cameras["eye"], intrinsics=replace(lens, fisheye=True))
     write_calibration(tmp_path / "calibration.toml", odd, rig)
     assert tomllib.loads((tmp_path / "calibration.toml").read_text())["eye"]["fisheye"] is True
+
+
+def test_a_missing_calibration_is_not_called_a_rig_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="calibration") as caught:
+        read_calibration(tmp_path / "known.toml")
+    assert "rig file" not in str(caught.value)
