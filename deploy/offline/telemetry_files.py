@@ -162,57 +162,63 @@ def check_attitudes(
     """
     from edge.uav.timing.telemetry_track import MAX_OFFSET_S
 
-    body_from_camera = footage.body_from_camera
-
-    def search(readings: list[_Reading]) -> list[tuple[OffsetSearch | None, GroundMotion | None, RelativeRotations]]:
-        rotations, _ = _visual_rotations(footage, readings)
-        limits = -MAX_OFFSET_S, MAX_OFFSET_S
-        out: list[tuple[OffsetSearch | None, GroundMotion | None, RelativeRotations]] = []
-        for seen, reading in zip(rotations, readings, strict=True):
-            found = search_offset(seen, *reading, limits)
-            searched = None if isinstance(found, str) else found
-            offset = 0.0 if searched is None or searched.evidence < searched.threshold else searched.offset
-            out.append((searched, compare_ways(seen, *reading, offset), seen))
-        return out
-
+    reading: _Reading = (recorded.samples, footage.body_from_camera)
+    [seen], _ = _visual_rotations(footage, [reading])
     # None where its camera looks at the sky.
-    given, motion, seen = search([(recorded.samples, body_from_camera)])[0]
+    given = _searched(search_offset(seen, *reading, (-MAX_OFFSET_S, MAX_OFFSET_S)))
+    wider = _searched(search_offset(seen, *reading))
     correlated = given is not None and given.evidence >= given.threshold
-    offset = None if given is None else accepted_offset(given, None, _MOST_STD_S)
-    found = search_offset(seen, recorded.samples, body_from_camera)
-    wider = None if isinstance(found, str) else found
-    if not correlated:
-        # A wrong convention can fit somewhere in all of the telemetry, too, and the right one far off.
-        others = search([read(recorded.samples, body_from_camera) for read in _CONVENTIONS.values()])
-        least = max(one.evidence if one is not None else 0.0 for one in (given, wider))
-        fits = {
-            one.evidence: name
-            for name, (one, _, _) in zip(_CONVENTIONS, others, strict=True)
-            if one is not None and one.evidence > least + one.threshold
-        }
-        if fits:
-            what = f"its attitudes do not turn as the video does, but would if {fits[max(fits)]}"
-            remedy = "give qw,qx,qy,qz of ned_from_body and body_from_camera; body axes are forward, right, down"
-            raise InputError(what, file=file, remedy=remedy)
+    motion = compare_ways(seen, *reading, given.offset if given is not None and correlated else 0.0)
+    offset, is_far = None if given is None else accepted_offset(given, None, _MOST_STD_S), False
     if wider is not None and (
         # A vehicle that sways shows a lower maximum each period.
         not isinstance(offset, OffsetEstimate) or given is None or wider.evidence > given.evidence + wider.threshold
     ):
         offset = accepted_offset(wider, None, _MOST_STD_S)
+        is_far = wider.evidence >= wider.threshold and abs(wider.offset) > MAX_OFFSET_S
+    # A wrong convention can fit somewhere, too. With each one's tilt the video is read once more: only where one may.
+    least = max(one.evidence if one is not None else 0.0 for one in (given, wider))
+    others = [read(*reading) for read in _CONVENTIONS.values()]
+    if not correlated or is_far or _better_conventions([seen] * len(others), others, least):
+        fits = _better_conventions(_visual_rotations(footage, others)[0], others, least)
+        if fits:
+            what = f"its attitudes do not turn as the video does, but would if {fits[max(fits)]}"
+            remedy = "give qw,qx,qy,qz of ned_from_body and body_from_camera; body axes are forward, right, down"
+            raise InputError(what, file=file, remedy=remedy)
     if isinstance(offset, OffsetEstimate):
         # The tracker finds small ones in flight, too, but its ground frame begins before.
         samples = tuple(replace(sample, time=sample.time - offset.offset) for sample in recorded.samples)
-        notes = _check_motion(compare_ways(seen, recorded.samples, body_from_camera, offset.offset), file)
+        notes = _check_motion(compare_ways(seen, *reading, offset.offset), file)
         if abs(offset.offset) > MAX_OFFSET_S:
             apart = f"{abs(offset.offset):.2f} s {'later' if offset.offset > 0.0 else 'earlier'}"
             what = f"by the rotation that both show its times are {apart} than the video's, and were corrected"
             notes = [f"{file}: {what}: 0 is the video's first frame", *notes]
         return samples, notes, True
+    if is_far:
+        notes = _check_motion(motion, file) if correlated else []
+        what = f"its times do not seem to be the video's, and are used as they are: {offset}"
+        return recorded.samples, [f"{file}: {what}: make time_s 0 at the video's first frame", *notes], False
     if correlated or given is None or not given.contradicts:
         return recorded.samples, _check_motion(motion, file), False
     turn = f"its attitudes turn by {math.degrees(given.telemetry_rms):.1f} degrees rms, but not as the video does"
     remedy = "check body_from_camera in --rig, and that both are of one flight and on one clock"
     return recorded.samples, [f"{file}: {turn}: {remedy}"], False
+
+
+def _searched(found: OffsetSearch | str) -> OffsetSearch | None:
+    return None if isinstance(found, str) else found
+
+
+def _better_conventions(
+    rotations: Sequence[RelativeRotations], readings: Sequence[_Reading], least: float
+) -> dict[float, str]:
+    """By evidence, the conventions whose readings turn as the video does anywhere, by more than is by chance."""
+    found = [_searched(search_offset(seen, *reading)) for seen, reading in zip(rotations, readings, strict=True)]
+    return {
+        one.evidence: name
+        for name, one in zip(_CONVENTIONS, found, strict=True)
+        if one is not None and one.evidence > least + one.threshold
+    }
 
 
 def _check_motion(motion: GroundMotion | None, file: Path) -> list[str]:

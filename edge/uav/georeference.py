@@ -107,7 +107,7 @@ class Georeference:
             gain = 1.0 if self.offset is None else -math.expm1(-max(time - self._known_s, 0.0) / _TIME_CONSTANT_S)
             self.offset = difference if self.offset is None else self.offset + gain * (difference - self.offset)
             # Errors of one report's positions are alike: the mean of the stds, not of their squares.
-            self._known_std += gain * (self._telemetry_std(measured, time) - self._known_std)
+            self._known_std += gain * (self._telemetry_std(measured, time, time) - self._known_std)
             self._known_s = time
         if self.offset is not None:
             place = place + self.offset
@@ -118,7 +118,10 @@ class Georeference:
         return replace(estimate, north=float(place[0]), east=float(place[1]), std_m=std_m)
 
     def _std_of_start(self, estimate: Estimate, time: float) -> float:
-        """Std [m], one coordinate, of a ground frame that begins at a time with the nearest sample."""
+        """Std [m], one coordinate, of a ground frame that begins at a time with the nearest sample.
+
+        Its attitude is continued up to that time, also beyond the last sample.
+        """
         nearest = self._telemetry.nearest_time(time)
         off = math.hypot(self._clock_std_s, time - nearest)
         early, late = (self._telemetry.nearest_time(nearest + shift) for shift in (-off, off))
@@ -127,13 +130,13 @@ class Georeference:
         if late > early and places[0] is not None and places[1] is not None:
             speed = float(np.hypot(*(places[1] - places[0]))) / (late - early)
         place = np.array([estimate.north, estimate.east])
-        return math.hypot(speed * off / math.sqrt(2.0), self._telemetry_std(place, nearest))
+        return math.hypot(speed * off / math.sqrt(2.0), self._telemetry_std(place, nearest, time))
 
-    def _telemetry_std(self, place: Floats, time: float) -> float:
-        """Std [m], one coordinate, of a place (2,) by the time to the samples around."""
-        position, tilt = self._telemetry.stds_at(time)
-        centre = self._centre_at(time)
-        return math.hypot(position, 0.0 if centre is None else _tilt_std(place, centre, tilt))
+    def _telemetry_std(self, place: Floats, time: float, attitude_time: float) -> float:
+        """Std [m], one coordinate, of a place (2,) by the position at one time and the attitude at another."""
+        centre, tilt = self._centre_at(time), self._telemetry.stds_at(attitude_time)[1]
+        aside = 0.0 if centre is None else _tilt_std(place, centre, tilt)
+        return math.hypot(self._telemetry.stds_at(time)[0], aside)
 
     def _centre_at(self, time: float) -> Floats | None:
         """Position (3,) of the vehicle, of its newest sample where none are near."""

@@ -55,8 +55,10 @@ def find_clock_step(problem: Problem, state: AdjustmentState) -> ClockStep | Non
     """
     if not problem.free_parameters.clock:
         return None
-    best = max(likely_clock_steps(problem, state) or (), key=lambda one: one.statistic, default=None)
-    if best is None or best.statistic <= needed_for_a_step(problem) or not _MIN_STEP_S < abs(best.size) <= MAX_STEP_S:
+    # What the stamps would show must not hide another camera's.
+    likely = [one for one in likely_clock_steps(problem, state) or () if _MIN_STEP_S < abs(one.size) <= MAX_STEP_S]
+    best = max(likely, key=lambda one: one.statistic, default=None)
+    if best is None or best.statistic <= needed_for_a_step(problem):
         return _step_of_rejected_rows(problem, state)
     return best
 

@@ -392,7 +392,8 @@ def _clock_step(
     found = clock_steps.find_clock_step(reconstruction.problem, reconstruction.state)
     if found is None:
         for scale, step, left in _remaining_steps(steps, prepared, reconstruction):
-            if abs(left.size) > left.std or left.std < _BETTER_KNOWN * scale * step[2]:
+            more = abs(left.size) > left.std or left.std < _BETTER_KNOWN * scale * step[2]
+            if more and abs(scale * step[1] + left.size) <= clock_steps.MAX_STEP_S:
                 found = left
     if found is None:
         return None

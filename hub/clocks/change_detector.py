@@ -30,6 +30,7 @@ from hub.clocks.delay_changepoint import (
     fit_line,
     slope_has_changed,
 )
+from protocols.session.builder import is_stray_number
 
 MIN_STEP_S = 0.2
 """Smaller steps cannot be distinguished from late frames [s]."""
@@ -112,6 +113,14 @@ class _ClockState:
     frames_until_period: int = 0
 
 
+def _is_out_of_order(
+    last: tuple[int, int, float, float | None], sequence: int, time: float, arrival: float | None
+) -> bool:
+    """Whether a frame comes late or its number is none. last, time, arrival: as of ``_ClockState.last``."""
+    elapsed = time - last[2] if arrival is None or last[3] is None else arrival - last[3]
+    return sequence <= last[0] or is_stray_number(sequence - last[0], elapsed)
+
+
 class ClockChangeDetector:
     """Detector for the clocks of all cameras. It has no clock of its own: arrival times are passed in."""
 
@@ -143,10 +152,10 @@ class ClockChangeDetector:
             clock = self._clocks[camera, boot] = _ClockState([(0, boot)])
         if clock.last is None:
             clock.origin_ns = device_ns
-        elif sequence <= clock.last[0]:
+        time = (device_ns - clock.origin_ns) * 1e-9  # Unix times in ns do not fit a float
+        if clock.last is not None and _is_out_of_order(clock.last, sequence, time, arrival):
             name = next((name for first, name in reversed(clock.segments) if first <= sequence), boot)
             return name, None
-        time = (device_ns - clock.origin_ns) * 1e-9  # Unix times in ns do not fit a float
         change = self._detect_step(clock, camera, sequence, frame, time, arrival, waited)
         clock.last = (sequence, frame, time, arrival)
         if change is None and arrival is not None and self._add_delay(clock, time, arrival):

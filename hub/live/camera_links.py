@@ -41,17 +41,14 @@ class CameraLinks:
         self.standing: dict[str, str] = {}
         """By camera, what is wrong with times that hardly advance, or numbers that do not."""
         self._muted: dict[str, str] = {}
-        self._windows: dict[str, tuple[int, float, pb.Observation, int]] = {}
-        """Frames, first arrival [s], the frame that arrived then, and the highest sequence."""
-        self._highest: dict[str, tuple[str, int]] = {}
-        """By camera, boot and highest sequence of it before the present window."""
+        self._windows: dict[str, tuple[int, float, pb.Observation]] = {}
+        """Frames, first arrival [s], and the frame that arrived then."""
 
     def forget(self, camera: str) -> None:
         """Forget a camera, as if it had never been heard of."""
         for of_camera in (self.last_frame, self.delays, self.camera_time, self.boots, self.notices, self.standing):
             of_camera.pop(camera, None)
         self._windows.pop(camera, None)
-        self._highest.pop(camera, None)
         self.fresh.discard(camera)
 
     def receive(self, message: pb.Observation, now: float, arrival: float | None, *, backlog: bool) -> None:
@@ -64,22 +61,26 @@ class CameraLinks:
             self.delays[camera] = arrival - camera_time
         self.last_frame[camera], self.boots[camera] = now, message.boot_id
 
-    def compare_rates(self, message: pb.Observation, arrival: float | None) -> None:
-        """Note a frame, also one left out, to find times and numbers that stand still. arrival: as of ``receive``."""
+    def compare_anew(self) -> None:
+        """Forget what is wrong with times and numbers, as of observations that are forgotten."""
+        self.standing.clear()
+        self._windows.clear()
+
+    def compare_rates(self, message: pb.Observation, arrival: float | None, repeated: tuple[int, int, int]) -> None:
+        """Note a frame, also one left out, to find times and numbers that stand still.
+
+        arrival: as of ``receive``. repeated: the camera's, as of `SessionBuilder`.
+        """
         if arrival is None:
             return
         camera, camera_time = message.camera, message.device_time_ns / NANOSECONDS
-        frames, began, first, newest = self._windows.get(camera, (0, arrival, message, 0))
+        frames, began, first = self._windows.get(camera, (0, arrival, message))
         if first.boot_id != message.boot_id:
-            frames, began, first, newest = 0, arrival, message, 0
-        newest = max(newest, message.sequence)
-        self._windows[camera] = frames + 1, began, first, newest
+            frames, began, first = 0, arrival, message
+        self._windows[camera] = frames + 1, began, first
         if frames < _RATE_FRAMES or arrival - began < _RATE_S:
             return
         del self._windows[camera]
-        boot, highest = self._highest.get(camera, ("", -1))
-        highest = highest if boot == message.boot_id else -1
-        self._highest[camera] = message.boot_id, max(newest, highest)
         rate = (camera_time - first.device_time_ns / NANOSECONDS) / (arrival - began)
         self.standing.pop(camera, None)
         if 0.0 <= rate < _LEAST_RATE:
@@ -91,10 +92,12 @@ class CameraLinks:
             self.standing[camera] = (
                 f"the frames of {camera} all have sequence {first.sequence}: it must count them, from 0"
             )
-        elif newest <= highest:  # parts of a history come later too, but among new frames
+        elif repeated[0] >= _RATE_FRAMES:  # parts of a history come later too, but among new frames
+            _, highest, later_ns = repeated
+            what = "counts its frames anew" if later_ns > 0 else "is replayed again, or counts frames and times anew,"
             self.standing[camera] = (
-                f"{camera} counts its frames anew ({message.sequence} after {highest}) under one boot_id, so they are "
-                "not used: each run must have a new one"
+                f"{camera} {what} ({message.sequence} after {highest}) under one boot_id, so its markers are not used: "
+                f"each run must have a new one{'' if later_ns > 0 else '; for a replay, restart the hub'}"
             )
 
     def ages(self, now: float, kept: Iterable[str]) -> dict[str, float]:

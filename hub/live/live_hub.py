@@ -137,6 +137,7 @@ class LiveHub:
     def _begin(self) -> None:
         """No observations and no result."""
         self.stream.forget()
+        self.links.compare_anew()
         self.tracking = LiveTracking() if self.settings.track else None
         self._schedule, self._received = JobSchedule(), 0
         self._submitted: SolverJob | None = None
@@ -176,7 +177,8 @@ class LiveHub:
             return
         if isinstance(message, pb.Observation):
             if not backlog and self.budgets.admits_camera(message.camera):
-                self.links.compare_rates(message, arrival)
+                repeated = self.stream.marker.repeated.get(message.camera, (0, 0, 0))
+                self.links.compare_rates(message, arrival, repeated)
             admitted = self.budgets.admit(message, self._now)
             if admitted is None:
                 room = self.budgets.admits_camera(message.camera)
@@ -228,7 +230,7 @@ class LiveHub:
         """Forget cameras that another hub has now."""
         for name in cameras:
             self.stream.release(name)
-            self.links.last_frame.pop(name, None)
+            self.links.forget(name)
             self._restarted.pop(name, None)
             self._moved.pop(name, None)
             self._rig_cameras.pop(name, None)
@@ -250,7 +252,6 @@ class LiveHub:
         self.release(names)
         for name in names:
             self.guidance.forget(name)
-            self.links.forget(name)
             self._pixel_faults.pop(name, None)
         if self.calibration is not None:
             left = {name: why for name, why in self.calibration.refused.items() if name not in names}
@@ -433,8 +434,9 @@ class LiveHub:
 
     def _moved_lately(self, cameras: Collection[str], now: float) -> str:
         """Which of the calibrated cameras were found to have been moved in the last minutes, for the status; or ""."""
-        ages = {name: now - found for name, found in sorted(self._moved.items()) if now - found < _MOVED_NOTICE_S}
-        if len(ages) == len(cameras) == 2:  # it does not show which one
+        found = {name: now - self._moved[name] for name in sorted(self._moved.keys() & cameras)}
+        ages = {name: age for name, age in found.items() if age < _MOVED_NOTICE_S}
+        if len(ages) == len(cameras) == 2 and len(set(ages.values())) == 1:  # it does not show which one
             return f", one of them moved {min(ages.values()):.0f} s ago"
         return f", moved: {listed(f'{name} ({age:.0f} s ago)' for name, age in ages.items())}" if ages else ""
 

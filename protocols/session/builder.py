@@ -16,6 +16,7 @@ from google.protobuf.message import Message
 
 from protocols.core.clocks import NANOSECONDS
 from protocols.core.errors import InputError, Refused
+from protocols.core.ranges import MAX_FPS
 from protocols.geometry import so3
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Bools, Floats, Ints
@@ -70,6 +71,8 @@ class _BootBuffer:
     room: tuple[int, int] = (-1, 0)
     seen: set[int] = field(default_factory=set)
     highest: int = -1
+    highest_at: tuple[int, float] = 0, 0.0
+    """Device time [ns] and moment of arrival [s] of the frame with the highest sequence number."""
     ring: bytearray | None = None
     """Bit ``sequence % _REMEMBERED``: received, for the last so many sequence numbers up to the highest."""
 
@@ -91,13 +94,15 @@ class _BootBuffer:
         self.seen.add(sequence)
         return False
 
-    def is_recent_duplicate(self, sequence: int) -> bool:
+    def is_recent_duplicate(self, sequence: int, time_ns: int, moment: float) -> bool:
         """The same in constant memory, for a hub that runs for months: a very old number counts as a duplicate."""
         if self.ring is None:
             self.ring = bytearray(
                 _DUPLICATE_WINDOW // 8
             )  # allocated at once: memory that grows for an hour looks like a leak
         ahead = sequence - self.highest
+        if self.highest >= 0 and is_stray_number(ahead, moment - self.highest_at[1]):
+            return False
         if -ahead >= _DUPLICATE_WINDOW:
             return True
         if ahead >= _DUPLICATE_WINDOW:
@@ -105,11 +110,20 @@ class _BootBuffer:
         elif ahead != 1:
             for between in range(self.highest + 1, sequence):
                 self.ring[between % _DUPLICATE_WINDOW >> 3] &= ~(1 << (between & 7))
-        self.highest = max(self.highest, sequence)
+        if ahead > 0:
+            self.highest, self.highest_at = sequence, (time_ns, moment)
         byte, bit = sequence % _DUPLICATE_WINDOW >> 3, 1 << (sequence & 7)
         known = ahead <= 0 and bool(self.ring[byte] & bit)
         self.ring[byte] |= bit
         return known
+
+
+def is_stray_number(ahead: int, elapsed_s: float) -> bool:
+    """Whether a sequence number is further ahead than a camera can have counted in this time [s].
+
+    By one within the memory for duplicates nothing is lost, and frames that waited come at once.
+    """
+    return ahead >= _DUPLICATE_WINDOW and ahead > MAX_FPS * elapsed_s
 
 
 _score = attrgetter("score")
@@ -138,6 +152,9 @@ class SessionBuilder:
         self._is_thinned = False
         self._selection: dict[str, list[tuple[str, int, int, int]]] | None = None
         self.counters: Counter[str] = Counter()
+        self.repeated: dict[str, tuple[int, int, int]] = {}
+        """By camera, frames with detections left out as duplicates since the last one that was none; the highest number
+        received, and how much later [ns] than that frame the last one of them is."""
 
     def handle(self, message: Message, moment: float = 0.0) -> None:
         """Take one message; other kinds are ignored. moment: of its arrival [s], any fixed clock."""
@@ -160,7 +177,7 @@ class SessionBuilder:
 
     def forget(self, camera: str) -> None:
         """Forget a camera and its detections, as if it had never been heard of."""
-        for of_camera in (self._cameras, self._rig_cameras, self._boots, self._labels_of):
+        for of_camera in (self._cameras, self._rig_cameras, self._boots, self._labels_of, self.repeated):
             of_camera.pop(camera, None)
 
     def forget_before(self, camera: str, time: float) -> None:
@@ -302,10 +319,14 @@ class SessionBuilder:
         if boot is None:
             self._forget_a_boot(camera)
             boot = boots[message.boot_id] = _BootBuffer()
-        known = boot.is_duplicate if self._chunks is None else boot.is_recent_duplicate
-        if known(sequence):
+        time_ns, is_live = message.device_time_ns, self._chunks is not None
+        if boot.is_recent_duplicate(sequence, time_ns, moment) if is_live else boot.is_duplicate(sequence):
             self.counters["duplicates"] += 1
+            if message.detections:
+                frames = self.repeated.get(camera, (0, 0, 0))[0] + 1
+                self.repeated[camera] = frames, boot.highest, time_ns - boot.highest_at[0]
             return
+        self.repeated.pop(camera, None)
         chunk = self._advance(moment)
         if self._is_thinned and message.frame % self._every(camera):
             self.counters["thinned"] += 1

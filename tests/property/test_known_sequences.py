@@ -13,7 +13,7 @@ def test_a_live_hub_knows_the_duplicates_that_a_set_knows(sequences: list[int]) 
     live, all_of_them = _BootBuffer(), _BootBuffer()
     highest = -1
     for sequence in sequences:
-        duplicate, known = live.is_recent_duplicate(sequence), all_of_them.is_duplicate(sequence)
+        duplicate, known = live.is_recent_duplicate(sequence, 0, 1.0 + sequence), all_of_them.is_duplicate(sequence)
         assert duplicate == (known or sequence <= highest - _DUPLICATE_WINDOW)
         highest = max(highest, sequence)
     assert live.ring is None or len(live.ring) == _DUPLICATE_WINDOW // 8

@@ -113,11 +113,16 @@ class Vehicle:
         return refused or (slow if self._spacing_s > _MAX_SPACING_S else "")
 
     def without_position(self, now_ns: int) -> str:
-        """That no position comes, as one line; "" where it does."""
-        since = self.frame.reported_s if self._first_s is None else max(self.frame.reported_s, self._first_s)
-        if not _MISSING_AFTER_S < now_ns / NANOSECONDS - since < math.inf:
-            return ""
-        return "no position of the autopilot (GLOBAL_POSITION_INT with a fix): targets have no place on the ground"
+        """That no position comes, or none on Earth, as one line; "" where it does."""
+        now, asked_s = now_ns / NANOSECONDS, math.inf if self._first_s is None else self._first_s
+        since = self.frame.reported_s if self._first_s is None else max(self.frame.reported_s, asked_s)
+        if _MISSING_AFTER_S < now - since < math.inf:
+            return "no position of the autopilot (GLOBAL_POSITION_INT with a fix): targets have no place on the ground"
+        if self.origin is None and now - asked_s > _MISSING_AFTER_S:
+            return (
+                "no GLOBAL_POSITION_INT with a fix: targets have no latitude and longitude, only metres from an origin"
+            )
+        return ""
 
     def tick(self, now_ns: int) -> None:
         """Send the TIMESYNC and rate requests that are due."""

@@ -32,6 +32,7 @@ from protocols.topics import FLIGHT_IMAGE, TELEMETRY, UAV_INFO
 from tests.support.samples import flight_image, uav_info
 from tests.support.videos import TICKS, write_video
 
+Checked = tuple[tuple[Telemetry, ...], list[str], bool]
 SIZE = (320, 240)
 FRAMES = 45
 TARGET = "92,118,36,16"
@@ -423,30 +424,79 @@ def test_positions_that_are_no_metres_above_the_ground_are_named(
     assert named in printed.out + printed.err
 
 
+@pytest.fixture
+def check_swaying(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Checked]:
+    """`check_attitudes` of a vehicle with some roll, pitch and yaw [rad], whose times are early and attitudes read by
+    a convention."""
+
+    def check(
+        angles: Callable[[Floats], list[Floats]],
+        early_s: float,
+        read: Callable[[Floats], Floats] = np.asarray,
+        pitch_deg: float = 90.0,
+    ) -> Checked:
+        times, pitch = np.arange(0.0, 14.0, 0.02), np.radians(pitch_deg)
+        attitudes = [rotation_from_euler(*of) for of in zip(*angles(times), strict=True)]
+        x, y = np.cos(pitch), np.sin(pitch)
+        mounting = np.array([[0.0, -y, x], [1.0, 0.0, 0.0], [0.0, x, y]])
+        camera = [(attitude @ mounting).T for attitude in attitudes[100:600:2]]
+        turns = np.array([so3.log(after @ before.T) for before, after in pairwise(camera)])
+        turns += np.random.default_rng(0).normal(0.0, 4e-4, turns.shape)
+        seen = RelativeRotations(times[100:598:2] - 2.0, times[102:600:2] - 2.0, turns)
+        monkeypatch.setattr(telemetry_files, "_visual_rotations", lambda _, readings: ([seen] * len(readings), 10.0))
+        early = tuple(Telemetry(time - 2.0 - early_s, read(one)) for time, one in zip(times, attitudes, strict=True))
+        lens = Intrinsics(640, 480, np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]]))
+        footage = telemetry_files.Footage(tmp_path / "a.mp4", None, lens, mounting, lambda frame: None)
+        return telemetry_files.check_attitudes(TelemetryFile(early, 0), tmp_path / "t.csv", footage)
+
+    return check
+
+
 @pytest.mark.parametrize("pitch_deg", [90.0, 45.0])
 def test_of_a_vehicle_that_sways_the_clock_is_that_of_the_whole_video(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pitch_deg: float
+    check_swaying: Callable[..., Checked], pitch_deg: float
 ) -> None:
     """1 s early, positions were 18 m off at stds of 0.3 m, one period later; or the quaternions were called ROS's."""
-    times, pitch = np.arange(0.0, 14.0, 0.02), np.radians(pitch_deg)
-    angles = [
-        0.05 * np.sin(2.5 * times) + 0.01 * np.sin(8.2 * times + 1.0),
-        0.05 * np.sin(2.1 * times + 0.4),
-        0.3 * np.sin(0.15 * times) + 0.02 * np.sin(4.4 * times),
-    ]
-    attitudes = [rotation_from_euler(*of) for of in zip(*angles, strict=True)]
-    mounting = np.array([[0.0, -np.sin(pitch), np.cos(pitch)], [1.0, 0.0, 0.0], [0.0, np.cos(pitch), np.sin(pitch)]])
-    camera = [(attitude @ mounting).T for attitude in attitudes[50:650:2]]
-    turns = np.array([so3.log(after @ before.T) for before, after in pairwise(camera)])
-    seen = RelativeRotations(times[50:648:2] - 1.0, times[52:650:2] - 1.0, turns)
-    monkeypatch.setattr(telemetry_files, "_visual_rotations", lambda footage, readings: ([seen] * len(readings), 12.0))
-    early = tuple(Telemetry(time - 2.0, attitude) for time, attitude in zip(times, attitudes, strict=True))
-    lens = Intrinsics(640, 480, np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]]))
-    footage = telemetry_files.Footage(tmp_path / "a.mp4", None, lens, mounting, lambda frame: None)
-    samples, [warning], aligned = telemetry_files.check_attitudes(TelemetryFile(early, 0), tmp_path / "t.csv", footage)
+
+    def angles(times: Floats) -> list[Floats]:
+        return [
+            0.05 * np.sin(2.5 * times) + 0.01 * np.sin(8.2 * times + 1.0),
+            0.05 * np.sin(2.1 * times + 0.4),
+            0.3 * np.sin(0.15 * times) + 0.02 * np.sin(4.4 * times),
+        ]
+
+    samples, [warning], aligned = check_swaying(angles, 1.0, pitch_deg=pitch_deg)
     assert aligned
-    assert samples[0].time == pytest.approx(-1.0, abs=0.02)
+    assert samples[0].time == pytest.approx(-2.0, abs=0.02)
     assert "1.00 s earlier than the video's" in warning
+
+
+def _swaying(rate: float, noise: float, yaw: float) -> Callable[[Floats], list[Floats]]:
+    """Roll and pitch of 3 degrees at one angular rate [rad/s]."""
+    return lambda times: [
+        0.05 * np.sin(rate * times) + noise * np.sin(8.2 * times + 1.0),
+        0.05 * np.sin(rate * times + 0.4),
+        yaw * np.sin(0.15 * times),
+    ]
+
+
+@pytest.mark.parametrize(("rate", "early_s"), [(5.0, 0.0), (5.0, 0.2), (5.0, -1.3), (2.5, 1.0)])
+def test_a_wrong_convention_that_fits_somewhere_is_named(
+    check_swaying: Callable[..., Checked], rate: float, early_s: float
+) -> None:
+    """Times of transposed attitudes that were 0.2 s early were corrected by 2.08 s; that were 1.3 s late, by 0.58 s."""
+    with pytest.raises(InputError, match="would if they were body_from_ned"):
+        check_swaying(_swaying(rate, 0.003, 0.1), early_s, np.transpose)
+
+
+@pytest.mark.parametrize("early_s", [1.0, -1.0, 1.5])
+def test_an_ambiguous_offset_is_no_wrong_mounting(check_swaying: Callable[..., Checked], early_s: float) -> None:
+    """Of a vehicle that only sways, attitudes and mounting were called wrong."""
+    samples, [warning], aligned = check_swaying(_swaying(2.5, 0.0, 0.0), early_s)
+    assert not aligned
+    assert samples[0].time == -2.0 - early_s
+    assert "used as they are: the offset is ambiguous" in warning
+    assert "body_from_camera" not in warning
 
 
 @pytest.mark.parametrize("late_s", [-0.25, 0.5, 2.0])

@@ -281,9 +281,14 @@ def test_an_autopilot_without_a_position_is_named() -> None:
         under_test.attitude(0.1 * k)
     assert under_test.vehicle.without_position(2_000_000_000) == ""  # not asked long enough
     assert under_test.vehicle.without_position(4_000_000_000).startswith("no position of the autopilot")
-    under_test.position(4.0)
-    assert under_test.vehicle.without_position(6_000_000_000) == ""
-    assert under_test.vehicle.without_position(8_000_000_000).startswith("no position of the autopilot")
+    under_test.position(4.0)  # metres from where it was switched on
+    assert under_test.vehicle.without_position(2_000_000_000) == ""
+    assert "no latitude and longitude" in under_test.vehicle.without_position(6_000_000_000)
+    under_test.take(
+        mavlink.MAVLink_global_position_int_message(boot_ms(6.0), 483_000_000, 88_000_000, 0, 50_000, 0, 0, 0, 0), 6.0
+    )
+    assert under_test.vehicle.without_position(7_000_000_000) == ""
+    assert under_test.vehicle.without_position(10_000_000_000).startswith("no position of the autopilot")
 
 
 def test_an_autopilot_that_signs_and_answers_nothing_is_named() -> None:

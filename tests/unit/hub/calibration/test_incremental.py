@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hub.bundle import clock_steps
 from hub.bundle.problem import ClockStep
-from hub.calibration.incremental import update_calibration
+from hub.calibration.incremental import _clock_step, update_calibration
 from hub.calibration.pipeline import calibrate
 from hub.clocks.external_prior import ERROR_BOUND_S, ArrivalPriors, ExternalClockPrior
 from protocols.core.clocks import CameraTime
@@ -352,6 +354,19 @@ def test_a_step_that_only_rejected_rows_ask_for_is_not_believed(monkeypatch: pyt
     monkeypatch.setattr(clock_steps, "find_clock_step", lambda problem, state: false.pop() if false else None)
     found = update_calibration(session.rig, session.observations(), last, full=False, search=False).calibration
     assert not any(one.clock_steps for one in found.cameras.values())
+
+
+@pytest.mark.parametrize(("more", "is_step"), [(0.04, True), (0.1, False), (-160_938.0, False)])
+def test_a_known_step_grows_to_no_more_than_stamps_hide(
+    monkeypatch: pytest.MonkeyPatch, more: float, is_step: bool
+) -> None:
+    """What was left of one was added to it, whatever its size."""
+    monkeypatch.setattr(clock_steps, "find_clock_step", lambda *_: None)
+    monkeypatch.setattr(clock_steps, "remaining_step", lambda *_: ClockStep(0, 2.0, more, 1e-4, 0.0))
+    prepared: Any = SimpleNamespace(time_scale=lambda _: 1.0, time_origins={"cam0": 0.0})
+    reconstruction: Any = SimpleNamespace(names=["cam0"], problem=None, state=None)
+    found = _clock_step({"cam0": ((2.0, 0.15, 1e-3),)}, prepared, reconstruction)
+    assert found == (("cam0", (2.0, more, 1e-4)) if is_step else None)
 
 
 def test_the_first_answer_of_a_window_with_a_clock_step_holds_after_it() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -77,20 +77,73 @@ def test_frames_that_are_not_counted_are_named() -> None:
     assert text in hub.state(200 * 0.033)[1]
 
 
-def test_a_camera_that_was_restarted_under_one_boot_id_is_named() -> None:
+@pytest.mark.parametrize(("goes_back", "text"), [(False, "b counts its frames anew ("), (True, "b is replayed again")])
+def test_a_camera_that_counts_anew_under_one_boot_id_is_named(goes_back: bool, text: str) -> None:
     """Its frames were left out as duplicates, and the hub was calibrated: for half a minute, or for good."""
     hub = LiveHub(LiveSettings(track=False))
     for number in range(900):
         for camera, sent in (("a", number), ("b", number % 500)):
-            hub.handle(frame(camera, sent), number * 0.033)
+            time_ns = (sent if goes_back else number) * 33_000_000
+            hub.handle(frame(camera, sent, device_time_ns=time_ns), number * 0.033)
         late = frame("a", max(number - 100, 0))  # a history that comes in parts, the newest first
         hub.handle(late, number * 0.033)
-    (text,) = hub.links.standing.values()
-    assert text.startswith("b counts its frames anew (")
-    assert text in hub.state(900 * 0.033)[1]
+    (fault,) = hub.links.standing.values()
+    assert fault.startswith(text)
+    assert "so its markers are not used" in fault
+    assert fault in hub.state(900 * 0.033)[1]
     for number in range(300):
         hub.handle(frame("b", number, boot_id="b1"), (900 + number) * 0.033)
     assert not hub.links.standing
+
+
+@pytest.mark.parametrize("forgotten", [LiveHub.reset, lambda hub: hub.release(["b"])])
+def test_after_a_reset_numbers_may_begin_anew(forgotten: Callable[[LiveHub], None]) -> None:
+    """Its rows were used, but the hub was degraded: "so they are not used"."""
+    hub = LiveHub(LiveSettings(track=False))
+    for number in range(900):
+        hub.handle(frame("b", number % 500, device_time_ns=number * 33_000_000), number * 0.033)
+    assert hub.links.standing
+    forgotten(hub)
+    assert not hub.links.standing
+    for number in range(900, 1300):
+        hub.handle(frame("b", number - 900, device_time_ns=number * 33_000_000), number * 0.033)
+    assert hub.stream.marker.rows("b") == 400
+    assert not hub.links.standing
+
+
+def test_people_are_used_whatever_the_numbers_are() -> None:
+    hub = LiveHub(LiveSettings(track=False))
+    for number in range(900):
+        message = frame("b", number % 500, device_time_ns=number * 33_000_000)
+        message.detections[0].kind, message.detections[0].label = "person", ""
+        hub.handle(message, number * 0.033)
+    assert not hub.links.standing
+
+
+@pytest.mark.parametrize("time_ns", [50 * 33_000_000, 10**9 * 33_000_000])
+def test_one_number_far_ahead_costs_no_frame(time_ns: int) -> None:
+    """All frames after it were duplicates, for good, and steps of the clock were not found."""
+    hub = LiveHub(LiveSettings(track=False))
+    for number in range(400):
+        now = number * 0.033
+        hub.tick(now)
+        stray = {"sequence": 10**9, "device_time_ns": time_ns} if number == 50 else {}
+        set_back = {"device_time_ns": number * 33_000_000 - 3600 * NANOSECONDS} if number >= 300 else {}
+        hub.handle(frame("b", number, **stray, **set_back), now)
+    assert hub.stream.marker.counters["duplicates"] == 0
+    assert hub.counters["clock_steps"] == 1
+    assert not hub.links.standing
+
+
+def test_of_moved_cameras_the_calibrated_ones_are_named() -> None:
+    """One of two, moved for itself, and a third that was taken away were "one of them"."""
+    hub, pair = LiveHub(LiveSettings(track=False)), ("cam0", "cam1")
+    hub._moved = {"cam1": 50.0, "cam3": 50.0}
+    assert hub._moved_lately(pair, 60.0) == ", moved: cam1 (10 s ago)"
+    hub._moved = {"cam0": 10.0, "cam1": 50.0}
+    assert hub._moved_lately(pair, 60.0) == ", moved: cam0 (50 s ago), cam1 (10 s ago)"
+    hub._moved = {"cam0": 50.0, "cam1": 50.0}
+    assert hub._moved_lately(pair, 60.0) == ", one of them moved 10 s ago"
 
 
 def test_a_camera_that_has_not_introduced_itself_is_told_so() -> None:
