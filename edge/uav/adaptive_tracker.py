@@ -18,9 +18,8 @@ from edge.uav.correlation.appearance_tracker import CENTRE_STD, AppearanceTracke
 from edge.uav.correlation.oriented_box import OrientedBox
 from edge.uav.ground.photometric import Contrast
 from edge.uav.ground_tracker import GroundTracker
-from edge.uav.image_motion.black_bars import picture_area
 from edge.uav.image_motion.repeated_images import is_repeated
-from edge.uav.target.box import check_target_box, has_frame_format
+from edge.uav.target.box import check_target_box
 from protocols.core.errors import InputError
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Floats, Image
@@ -230,75 +229,6 @@ class AdaptiveTracker:
             return replace(estimate, basis=Basis.STABILISED, reason=reason)
         reason = "too few corners around move alike" if self._frame else "the first image shows no motion"
         return replace(estimate, basis=Basis.IMAGE, reason=reason)
-
-
-class WithoutBars:
-    """``AdaptiveTracker`` of the picture in an image; its arguments, and all pixels in and out, are of the image.
-
-    others: body_from_camera, fps and seed.
-    """
-
-    def __init__(
-        self, size: tuple[int, int], lens: Intrinsics | None, others: tuple[Floats | None, float, int]
-    ) -> None:
-        self._size, self._lens, self._others = size, lens, others
-        self._tracker = AdaptiveTracker(size, lens, *others)
-        self._samples: list[Telemetry] = []
-        self._area = (0, 0, *size)
-
-    def begin(self, image: Image, time: float, target: Box) -> Estimate:
-        """Initialise the target from its first frame. Raises InputError for an invalid box."""
-        check_target_box(image, self._size, target)
-        before = self._area[2:]
-        self._area = x, y, width, height = picture_area(image)
-        inside = replace(target, x=target.x - x, y=target.y - y)
-        try:
-            check_target_box(self._cut(image), (width, height), inside)
-        except InputError:  # there is something to see where it was marked: these are no bars
-            self._area, inside = (0, 0, *self._size), target
-            x, y, width, height = self._area
-        if (width, height) != before:
-            lens = self._lens
-            if lens is not None:
-                matrix = lens.matrix - [[0.0, 0.0, x], [0.0, 0.0, y], [0.0, 0.0, 0.0]]
-                lens = replace(lens, width=width, height=height, matrix=matrix)
-            self._tracker = AdaptiveTracker((width, height), lens, *self._others)
-            for sample in self._samples:
-                self._tracker.handle_telemetry(sample)
-        return self._in_image(self._tracker.begin(self._cut(image), time, inside))
-
-    def handle_telemetry(self, sample: Telemetry) -> None:
-        """Add one sample."""
-        self._samples = [*self._samples[-199:], sample]
-        self._tracker.handle_telemetry(sample)
-
-    def handle_frame(self, image: Image | None, time: float) -> Estimate:
-        """Track the target into the next frame; ``None`` for a frame that could not be decoded."""
-        if image is not None:
-            image = self._cut(image) if has_frame_format(image, self._size) else None
-        return self._in_image(self._tracker.handle_frame(image, time))
-
-    def road_outline(self) -> tuple[Floats, Floats | None]:
-        """The observed road near the target, see ``GroundTracker``."""
-        pixels, ground = self._tracker.road_outline()
-        return pixels + self._area[:2], ground
-
-    def _cut(self, image: Image) -> Image:
-        x, y, width, height = self._area
-        return np.ascontiguousarray(image[y : y + height, x : x + width])
-
-    def _in_image(self, e: Estimate) -> Estimate:
-        corner = np.array(self._area[:2])
-        if not corner.any():
-            return e
-        return replace(
-            e,
-            x=e.x + corner[0],
-            y=e.y + corner[1],
-            hypotheses=tuple(replace(h, x=h.x + corner[0], y=h.y + corner[1]) for h in e.hypotheses),
-            particles=None if e.particles is None else e.particles + corner,
-            layers={name: points + corner for name, points in e.layers.items()},
-        )
 
 
 def _is_tall(ground: GroundTracker) -> bool:

@@ -25,9 +25,9 @@ def make_tracker(
     Raises InputError for an unknown name.
     """
     if name == "ground":
-        from edge.uav.adaptive_tracker import WithoutBars
+        from edge.uav.picture_tracker import PictureTracker
 
-        return WithoutBars(size, lens, (body_from_camera, fps, seed))
+        return PictureTracker(size, lens, (body_from_camera, fps, seed))
     if name == "paper":
         from edge.uav.baselines.paper_tracker import PaperTracker
 

@@ -32,6 +32,7 @@ from tests.bench.uav_sequences import (
     Sequence,
     aerial,
     barred,
+    beneath_reticle,
     mirrored,
     oblique,
     pan_away,
@@ -42,7 +43,7 @@ from tests.bench.uav_sequences import (
 from tests.support.oblique.world import FLIGHTS, TARGETS, ObliqueWorld
 
 MODELS = ("ground", *uav_rivals.NAMES)
-CHANGES = {"none": lambda sequence: sequence, "bars": barred, "zoom": zoomed}
+CHANGES = {"none": lambda sequence: sequence, "bars": barred, "zoom": zoomed, "reticle": beneath_reticle}
 NEAR_PX, HELD_FRAMES = 20.0, 20
 _RATES = (10.0, 15.0, 30.0)
 _COVERED = (0.4, 0.85)  # share of a target that is seen in a first box that shows a screen before it
@@ -281,7 +282,9 @@ def main() -> None:
     parser.add_argument("--kinds", default="", help="only these kinds, by comma: rendered, oblique, 'oblique away' …")
     parser.add_argument("--light", default="", help="change the images: dusk, haze, flicker")
     parser.add_argument("--every", type=int, default=1, help="only every so many sequences")
-    parser.add_argument("--changed", choices=CHANGES, default="none", help="black bars; a zoom by 2 within one frame")
+    parser.add_argument(
+        "--changed", choices=CHANGES, default="none", help="black bars; a zoom by 2 in one frame; a reticle"
+    )
     parser.add_argument(
         "--copies", type=int, default=1, help="of each sequence, all but one with a grey level of noise"
     )

@@ -90,6 +90,18 @@ def barred(whole: Sequence, rows: int = 40) -> Sequence:
     return replace(whole, images=[np.asarray(image, np.uint8) for image in images], box=whole.box + [0.0, rows, 0, 0])
 
 
+def beneath_reticle(whole: Sequence) -> Sequence:
+    """A sequence with a white cross about the middle of the first box, a third of its longer side each way."""
+    middle = whole.box[0, :2] + 0.5 * whole.box[0, 2:]
+    reach, (x, y) = max(8, round(0.35 * float(whole.box[0, 2:].max()))), np.rint(middle).astype(int).tolist()
+    images = [image.copy() for image in whole.images]
+    for image in images:
+        for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+                cv2.line(image, (x + 3 * dx, y + 3 * dy), (x + reach * dx, y + reach * dy), colour, width)
+    return replace(whole, images=images)
+
+
 def zoomed(whole: Sequence, factor: float = 2.0) -> Sequence:
     """A sequence that is zoomed in within one frame after a third of it, the view about the target from then on."""
     size, first = np.array(whole.size, dtype=np.float64), len(whole.images) // 3 + 1

@@ -17,7 +17,7 @@ Gray = npt.NDArray[np.uint8]
 _REDUCTION = 4  # of the images that are compared: the noise of a pixel leaves no change
 _COARSE_PX = 9  # side of the neighbourhood over which brightness may change [px, reduced]
 _STOOD_PX = 0.5  # of a corner [px of the working image]: ten times the error of a sharp one
-_ALIKE = 0.8  # correlation of pictures of one scene from one place; noise of 3 levels at dusk leaves 0.9
+ALIKE = 0.8  # correlation of pictures of one scene from one place; noise of 3 levels at dusk leaves 0.9
 _REACH_PX = 12  # about such a corner within which others are burnt in, too: the spacing of corners [px]
 _MOST = 0.65  # share of the picture that is left: a display takes 0.23 to 0.30, what strong compression freezes more
 
@@ -34,10 +34,8 @@ class BurntIn:
         """Whether a picture has changed while the motions (2, 3) since an earlier one say that nothing has moved."""
         self._moved = self._moved + shift(gray, matrix)
         if self._since is not None and np.abs(self._moved).max() < 2.0 * _STOOD_PX:
-            detail = _detail(gray)
-            alike = float((detail * self._since).sum())
-            return alike < _ALIKE * float(np.linalg.norm(detail)) * float(np.linalg.norm(self._since))
-        self._since, self._moved = _detail(gray), np.zeros((2, 2))
+            return float((detail(gray) * self._since).sum()) < ALIKE
+        self._since, self._moved = detail(gray), np.zeros((2, 2))
         return False
 
     def restart(self) -> None:
@@ -74,8 +72,9 @@ def stood(old: Floats, new: Floats) -> Floats:
     return np.asarray(old[np.abs(new - old).max(axis=1, initial=0.0) < _STOOD_PX])
 
 
-def _detail(gray: Gray) -> Floats:
-    """The reduced picture without its coarse brightness, (h, w)."""
+def detail(gray: Gray) -> Floats:
+    """The reduced picture without its coarse brightness, as a unit vector, (h, w)."""
     small = cv2.resize(gray, None, fx=1.0 / _REDUCTION, fy=1.0 / _REDUCTION, interpolation=cv2.INTER_AREA)
     level = small.astype(np.float32)
-    return np.asarray(level - cv2.blur(level, (_COARSE_PX, _COARSE_PX)))
+    fine = level - cv2.blur(level, (_COARSE_PX, _COARSE_PX))
+    return np.asarray(fine / (float(np.linalg.norm(fine)) + 1e-6))
