@@ -111,7 +111,7 @@ def moved_cameras(solution: Solution, observations: Observations) -> dict[str, M
             (one for at in maps if (one := _divide(labels, prepared.cameras[name], *at, _MOST_MOVES))), default=None
         )
         divisions |= {} if found is None else {name: found}
-    placed = moved_camera(prepared, reconstruction, _MOST_MOVES)
+    placed = moved_camera(prepared, reconstruction)
     divisions |= {} if placed is None else {placed[0]: placed[1]}
     return {
         name: _longest_part(
@@ -133,11 +133,11 @@ def _longest_part(moved: Floats, turned: tuple[float, ...], rows: Floats) -> Mov
     return Move(tuple(moved.tolist()), turned, longest, int(parts.sum() - parts[longest]))
 
 
-def moved_camera(
-    prepared: PreparedSession, reconstruction: Reconstruction, most: int = 1
-) -> tuple[str, Division] | None:
-    """Of the placed cameras the one that most probably was moved, which distorts the path for all, at most ``most``
-    times. None where none was, or where fewer than two others are placed.
+def moved_camera(prepared: PreparedSession, reconstruction: Reconstruction) -> tuple[str, Division] | None:
+    """Of the placed cameras the one that most probably was moved, which distorts the path for all. None where none was,
+    or where fewer than two others are placed.
+
+    One move is looked for: three explained the wrong lenses of a real rig whose cameras stood still.
 
     It is the one without which the others fit best. The path may follow it, where it has the most frames, and then the
     others seem to have been moved: of two of those, one that was moved before fits the path of those left no better.
@@ -147,10 +147,10 @@ def moved_camera(
     changes = {name: _cost_change(_costs(reconstruction, name)) for name in reconstruction.names}
     if max(changes.values()) >= _LEAST_PX**2:
         likely = _best_without(prepared, reconstruction, changes)
-        found = None if likely is None else _division(prepared, reconstruction, *likely, most)
+        found = None if likely is None else _division(prepared, reconstruction, *likely)
         if likely is not None and found is not None:
             return likely[0], found
-    divided = {name: _division(prepared, reconstruction, name, reconstruction, most) for name in reconstruction.names}
+    divided = {name: _division(prepared, reconstruction, name, reconstruction) for name in reconstruction.names}
     return max(((name, one) for name, one in divided.items() if one), key=lambda one: one[1], default=None)
 
 
@@ -206,7 +206,7 @@ def _without(prepared: PreparedSession, reconstruction: Reconstruction, name: st
 
 
 def _division(
-    prepared: PreparedSession, reconstruction: Reconstruction, name: str, paths: Reconstruction, most: int
+    prepared: PreparedSession, reconstruction: Reconstruction, name: str, paths: Reconstruction
 ) -> Division | None:
     """As `_divide`: of a placed camera, against the paths of a reconstruction with or without it."""
     given, clock = prepared.cameras[name], reconstruction.state.cameras[reconstruction.names.index(name)]
@@ -215,7 +215,7 @@ def _division(
         rays = [lens.unproject(given.intrinsics.project_normalised(one.track.points)) for one in labels]
         labels = [replace(one, track=replace(one.track, points=ray)) for one, ray in zip(labels, rays, strict=True)]
     offset = clock.offset - clock.rate * clock.centre
-    return _divide(labels, replace(given, intrinsics=lens), clock.rate, offset, most) if labels else None
+    return _divide(labels, replace(given, intrinsics=lens), clock.rate, offset, 1) if labels else None
 
 
 def without_moved(observations: Observations, moves: Mapping[str, Move]) -> Observations:
