@@ -25,7 +25,7 @@ def make_tracker(
     Raises InputError for an unknown name.
     """
     if name == "ground":
-        from edge.uav.picture_tracker import PictureTracker
+        from edge.uav.adaptive_tracker import PictureTracker
 
         return PictureTracker(size, lens, (body_from_camera, fps, seed))
     if name == "paper":

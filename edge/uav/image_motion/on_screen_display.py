@@ -23,7 +23,7 @@ _UNCHANGED = 0.01  # of the target's box besides what is drawn over it, when the
 _LEAST_SHARE = 0.05
 """Of the target's box that a display covers: at that moment 0 to 3.2 % was found in 41 rendered and real flights
 without one, 8.1 to 87 % in 52 with a reticle."""
-_LESS, _MORE = 0.8, 1.25  # of what was drawn, and of the changes, when it is looked at anew: the target has moved on
+_LESS, _MORE = 0.8, 2.0  # of what was drawn, and of the changes, when it is looked at anew: the target has moved on
 _GIVE_UP_S = 20.0  # after which a target has left what it was marked beneath, or all stands still
 _KEPT, _KEPT_BYTES = 24, 1e8  # images since the first, at most; 16 of full HD, 6 of ultra-HD
 

@@ -12,7 +12,7 @@ from edge.uav.image_motion.on_screen_display import OnScreenDisplay
 from edge.uav.tracker_factory import make_tracker
 from protocols.geometry.types import Image
 
-SIZE, FPS, FRAMES = (480, 270), 15.0, 45
+SIZE, FPS, FRAMES = (480, 270), 15.0, 75
 SIDES = (40, 24)
 
 
