@@ -15,12 +15,11 @@ import numpy as np
 from scipy.special import chdtri, fdtri
 
 from edge.lens.board import MIN_CORNERS, BoardView
+from edge.lens.coverage import COVERAGE_GRID, corner_counts, uncovered_sides
 from protocols.core.errors import Refused
 from protocols.geometry.camera import Intrinsics
 from protocols.geometry.types import Bools, Floats, Ints
 
-COVERAGE_GRID = (8, 6)
-"""Columns and rows of the grid over the image on which coverage is counted."""
 MIN_VIEWS = 8
 """From so many views on a lens counts as measured; fewer give one with a wide std, if they fix it at all."""
 _LEAST_VIEWS = 3  # of which a focal length follows at all
@@ -123,10 +122,10 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
     accepted = [replace(views[i], points=views[i].points - middle) for i in chosen]
     limit = _MAX_RMS * max(1.0, size[0] / 1280)
     accepted = _ahead(accepted, size, limit) if fisheye else accepted
-    cells = _corner_counts(accepted, size)
+    cells = corner_counts(accepted, size)
     coverage = float((cells > 0).mean())
     if coverage < _MIN_COVERAGE and not few:
-        empty = _uncovered_sides(cells)
+        empty = uncovered_sides(cells)
         raise Refused(
             f"the board covers {100 * coverage:.0f} % of the picture, {100 * _MIN_COVERAGE:.0f} % are needed: "
             f"move it into {empty} too"
@@ -165,7 +164,7 @@ def calibrate_lens(views: list[BoardView], size: tuple[int, int], fisheye: bool 
     heights = (_by_shape(points) @ fit.parameters[-_SHAPE:])[:, 2]
     plane = np.column_stack([points[:, :2], np.ones(len(points))])
     bow = float(np.ptp(heights - plane @ np.linalg.lstsq(plane, heights)[0]))
-    counts = _corner_counts(accepted, size)
+    counts = corner_counts(accepted, size)
     stretch = float(fit.parameters[-1])
     lens, border = _lens(fit, size, fisheye), _border_std(_lens(fit, size, fisheye), at, free)
     return LensCalibration(lens, rms, std, border, limit, len(accepted), counts, coverage, bow, stretch)
@@ -177,11 +176,6 @@ def intrinsics_from_field_of_view(size: tuple[int, int], degrees: float, fisheye
     focal = 0.5 * size[0] / (half if fisheye else np.tan(half))
     matrix = np.array([[focal, 0.0, 0.5 * (size[0] - 1)], [0.0, focal, 0.5 * (size[1] - 1)], [0.0, 0.0, 1.0]])
     return Intrinsics(size[0], size[1], matrix, np.zeros(4 if fisheye else 5), fisheye)
-
-
-def coverage_map(cells: Ints) -> list[str]:
-    """The corner counts as a text grid; a dot = none."""
-    return ["".join(f"{value:5d}" if value else "    ." for value in row) for row in cells.tolist()]
 
 
 def _usual(views: list[BoardView], size: tuple[int, int]) -> tuple[_Fit, _Linearised, Floats]:
@@ -445,25 +439,3 @@ def _by_shape(points: Floats) -> Floats:
     (x, y), zero = points[:, :2].T, np.zeros(len(points))
     rows = [zero] * 4, [zero, zero, zero, y], [x * x, x * y, y * y, zero]
     return np.stack([np.column_stack(row) for row in rows], axis=1)
-
-
-def _corner_counts(views: list[BoardView], size: tuple[int, int]) -> Ints:
-    pixels = np.concatenate([view.pixels for view in views])
-    across = np.clip((pixels[:, 0] + 0.5) / size[0] * COVERAGE_GRID[0], 0, COVERAGE_GRID[0] - 1).astype(np.int64)
-    down = np.clip((pixels[:, 1] + 0.5) / size[1] * COVERAGE_GRID[1], 0, COVERAGE_GRID[1] - 1).astype(np.int64)
-    columns, rows = COVERAGE_GRID
-    return np.bincount(down * columns + across, minlength=columns * rows).reshape(rows, columns)
-
-
-def _uncovered_sides(cells: Ints) -> str:
-    """The sides of the image with the fewest covered cells, in words."""
-    rows, columns = COVERAGE_GRID[1] // 3, COVERAGE_GRID[0] // 3
-    sides = {
-        "the left": cells[:, :columns],
-        "the right": cells[:, -columns:],
-        "the top": cells[:rows],
-        "the bottom": cells[-rows:],
-    }
-    shares = {name: float((part > 0).mean()) for name, part in sides.items()}
-    least = min(shares.values())
-    return " and ".join(name for name, share in shares.items() if share <= least + 0.1)

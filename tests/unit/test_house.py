@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tests.unit.test_structure import PACKAGES, ROOT, _tracked
 
-MOST_SOURCE_LINES = 101348
+MOST_SOURCE_LINES = 101360
 MOST_UNEXPLAINED_CONSTANTS = 0
 MOST_COMPLEXITY = 15
 

@@ -80,8 +80,9 @@ def intrinsics(
     from edge.detectors.board.description import Board, check_board
     from edge.devices.playback.video_reader import VideoReader
     from edge.lens.board import BoardView, board_views
+    from edge.lens.coverage import coverage_map
     from edge.lens.models import FIELD_OF_VIEW_STD, find_lens_model, horizontal_field_of_view
-    from edge.lens.solve import MIN_VIEWS, LensCalibration, calibrate_lens, coverage_map, intrinsics_from_field_of_view
+    from edge.lens.solve import MIN_VIEWS, LensCalibration, calibrate_lens, intrinsics_from_field_of_view
     from protocols.core.files import write_atomically
 
     name = name_from_file(video.stem, video) if camera is None else check_name(camera, "--camera")
